@@ -1,0 +1,70 @@
+"""Humanoid: run forward on two legs."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from mjx_walk.envs.physics import Derived, PhysicsState
+from mjx_walk.envs.humanoid_body import HumanoidBody, HumanoidBodyOptions
+from mjx_walk.envs.task import Memory, State
+
+
+@dataclasses.dataclass
+class HumanoidOptions(HumanoidBodyOptions):
+    """Keywords of Gymnasium's `HumanoidEnv`. In v4 there is no contact cost, and its keywords have no effect."""
+
+    name: str = "humanoid"
+    forward_reward_weight: float = 1.25
+    ctrl_cost_weight: float = 0.1
+    contact_cost_weight: float = 5e-7
+    contact_cost_range: tuple[float, float] = (-float("inf"), 10.0)
+    healthy_reward: float = 5.0
+    terminate_when_unhealthy: bool = True
+    healthy_z_range: tuple[float, float] = (1.0, 2.0)
+
+
+class Humanoid(HumanoidBody):
+    """Source: `gymnasium/envs/mujoco/humanoid_v5.py` and `humanoid_v4.py`."""
+
+    GYMNASIUM_NAME = "Humanoid"
+    XML_FILES = {"v5": "humanoid.xml", "v4": "humanoid.xml"}
+    REWARD_TERMS = {
+        "v5": ("reward_survive", "reward_forward", "reward_ctrl", "reward_contact"),
+        "v4": ("reward_alive", "reward_linvel", "reward_quadctrl"),
+    }
+    V5_ONLY = (*HumanoidBody.V5_ONLY, "contact_cost_weight", "contact_cost_range")
+
+    options: HumanoidOptions
+
+    def derived_names(self) -> tuple[str, ...]:
+        return (*super().derived_names(), "xipos")
+
+    def remember(self, physics: PhysicsState, derived: Derived) -> Memory:
+        """The mass centre's x, y, which the next step's velocity is measured from."""
+        mass = jnp.asarray(self.model.body_mass, jnp.float32)
+        return {"mass_center": (mass[:, None] * derived["xipos"]).sum(0)[:2] / mass.sum()}
+
+    def evaluate(self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array):
+        options = self.options
+        low, high = options.healthy_z_range
+        is_healthy = (low < physics.qpos[2]) & (physics.qpos[2] < high)
+        terminated = ~is_healthy & options.terminate_when_unhealthy
+        velocity = (memory["mass_center"][0] - before.memory["mass_center"][0]) / self.dt
+
+        forward = options.forward_reward_weight * velocity
+        ctrl = -options.ctrl_cost_weight * jnp.square(action).sum()
+        if options.version == "v4":
+            # v4 pays the healthy reward on the step that ends the episode, too.
+            alive = options.healthy_reward * (is_healthy | options.terminate_when_unhealthy)
+            terms = {"reward_alive": alive, "reward_linvel": forward, "reward_quadctrl": ctrl}
+        else:
+            contact = -self.contact_cost(derived, options.contact_cost_weight, options.contact_cost_range)
+            survive = options.healthy_reward * is_healthy
+            terms = {
+                "reward_survive": survive,
+                "reward_forward": forward,
+                "reward_ctrl": ctrl,
+                "reward_contact": contact,
+            }
+        return terms, sum(terms.values()), terminated

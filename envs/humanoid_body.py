@@ -1,0 +1,78 @@
+"""What Humanoid and HumanoidStandup share: the body and its observation."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from mjx_walk.envs.physics import Derived, PhysicsState
+from mjx_walk.envs.task import Task, TaskOptions
+from mjx_walk.errors import UserError
+
+NUM_ROOT_DOFS = 6
+"""Degrees of freedom of the free root joint, which has no motor."""
+
+
+@dataclasses.dataclass
+class HumanoidBodyOptions(TaskOptions):
+    """Gymnasium's observation flags, v5 only."""
+
+    include_cinert_in_observation: bool = True
+    include_cvel_in_observation: bool = True
+    include_qfrc_actuator_in_observation: bool = True
+    include_cfrc_ext_in_observation: bool = True
+
+
+class HumanoidBody(Task):
+    """Observation and contact cost of the 17-motor humanoid."""
+
+    V5_ONLY: tuple[str, ...] = (
+        "xml_file",
+        "frame_skip",
+        "include_cinert_in_observation",
+        "include_cvel_in_observation",
+        "include_qfrc_actuator_in_observation",
+        "include_cfrc_ext_in_observation",
+    )
+    """Keywords that Gymnasium's v4 class does not take."""
+
+    options: HumanoidBodyOptions
+
+    def __init__(self, options: HumanoidBodyOptions, physics: str = "auto"):
+        if options.version == "v4":
+            defaults = type(options)()
+            changed = [name for name in self.V5_ONLY if getattr(options, name) != getattr(defaults, name)]
+            if changed:
+                raise UserError(f"{options.name} v4 does not take {', '.join(changed)}; use version=v5")
+        super().__init__(options, physics)
+
+    def observed_arrays(self) -> tuple[str, ...]:
+        """The observation's `mjData` arrays after positions and velocities, in order."""
+        flags = {
+            "cinert": self.options.include_cinert_in_observation,
+            "cvel": self.options.include_cvel_in_observation,
+            "qfrc_actuator": self.options.include_qfrc_actuator_in_observation,
+            "cfrc_ext": self.options.include_cfrc_ext_in_observation,
+        }
+        return tuple(name for name, is_included in flags.items() if is_included)
+
+    def derived_names(self) -> tuple[str, ...]:
+        # The contact cost needs cfrc_ext even where it is not observed.
+        return tuple(dict.fromkeys((*self.observed_arrays(), "cfrc_ext")))
+
+    def observe(self, physics: PhysicsState, derived: Derived) -> jax.Array:
+        """`[348]` in v5: positions without x, y (22), velocities (23), then per body `cinert` (130), `cvel` (78),
+        motor torques (17) and contact forces `cfrc_ext` (78).
+
+        v4 keeps the world body's zero rows and the root's zero torques: `[376]`.
+        """
+        is_v4 = self.options.version == "v4"
+        first_row = {name: 0 if is_v4 else 1 for name in ("cinert", "cvel", "cfrc_ext")}
+        first_row["qfrc_actuator"] = 0 if is_v4 else NUM_ROOT_DOFS
+        blocks = [derived[name][first_row[name] :].ravel() for name in self.observed_arrays()]
+        qpos = physics.qpos[2:] if self.options.exclude_current_positions_from_observation else physics.qpos
+        return jnp.concatenate([qpos, physics.qvel, *blocks])
+
+    def contact_cost(self, derived: Derived, weight: float, bounds: tuple[float, float]) -> jax.Array:
+        """Penalty on the squared contact forces of all bodies, clipped; positive."""
+        return jnp.clip(weight * jnp.square(derived["cfrc_ext"]).sum(), *bounds)

@@ -1,0 +1,51 @@
+"""HumanoidStandup: rise from lying on the back, and stay up."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from mjx_walk.envs.physics import Derived, PhysicsState
+from mjx_walk.envs.humanoid_body import HumanoidBody, HumanoidBodyOptions
+from mjx_walk.envs.task import Memory, State
+
+
+@dataclasses.dataclass
+class HumanoidStandupOptions(HumanoidBodyOptions):
+    """Keywords of Gymnasium's `HumanoidStandupEnv`. v4 takes none of them."""
+
+    name: str = "humanoid_standup"
+    uph_cost_weight: float = 1.0
+    """Stored and never used, as in Gymnasium."""
+    ctrl_cost_weight: float = 0.1
+    impact_cost_weight: float = 0.5e-6
+    impact_cost_range: tuple[float, float] = (-float("inf"), 10.0)
+
+
+class HumanoidStandup(HumanoidBody):
+    """Source: `gymnasium/envs/mujoco/humanoidstandup_v5.py` and `humanoidstandup_v4.py`."""
+
+    GYMNASIUM_NAME = "HumanoidStandup"
+    XML_FILES = {"v5": "humanoidstandup.xml", "v4": "humanoidstandup.xml"}
+    REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_linup", "reward_quadctrl", "reward_impact"))
+    V5_ONLY = (
+        *HumanoidBody.V5_ONLY,
+        "reset_noise_scale",
+        "exclude_current_positions_from_observation",
+        "uph_cost_weight",
+        "ctrl_cost_weight",
+        "impact_cost_weight",
+        "impact_cost_range",
+    )
+
+    options: HumanoidStandupOptions
+
+    def evaluate(self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array):
+        options = self.options
+        terms = {
+            # Divided by the physics step, not by the environment's.
+            "reward_linup": physics.qpos[2] / self.model.opt.timestep,
+            "reward_quadctrl": -options.ctrl_cost_weight * jnp.square(action).sum(),
+            "reward_impact": -self.contact_cost(derived, options.impact_cost_weight, options.impact_cost_range),
+        }
+        return terms, sum(terms.values()) + 1.0, jnp.zeros((), bool)

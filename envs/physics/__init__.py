@@ -1,0 +1,57 @@
+"""Three engines behind one interface: `warp` and `jax` (MJX), and `c` (MuJoCo's C library)."""
+
+import importlib.util
+
+import jax
+import mujoco
+
+from mjx_walk.envs.physics.base import Derived, Engine, PhysicsState
+from mjx_walk.errors import UserError
+
+ENGINES = ("warp", "jax", "c")
+
+__all__ = ["ENGINES", "Derived", "Engine", "PhysicsState", "make_engine", "resolve_engine"]
+
+
+def resolve_engine(name: str) -> str:
+    """The engine that `name` stands for on this machine.
+
+    Args:
+        name: an engine, or `auto`: `warp` on an NVIDIA GPU where Warp is installed, `jax` on any other
+            accelerator, `c` on a CPU.
+
+    Raises:
+        UserError: the name is unknown, Warp is not installed, or `c` is asked for on an accelerator.
+    """
+    platform = jax.default_backend()
+    has_warp = importlib.util.find_spec("warp") is not None
+    if name == "auto":
+        if platform == "cpu":
+            return "c"
+        is_nvidia = platform == "gpu" and "nvidia" in jax.devices()[0].device_kind.lower()
+        return "warp" if is_nvidia and has_warp else "jax"
+    if name not in ENGINES:
+        raise UserError(f"unknown physics '{name}'; choose one of: auto, {', '.join(ENGINES)}")
+    if name == "warp" and not has_warp:
+        raise UserError("physics=warp needs Warp: install it with pip install 'mjx-walk[warp]', or use physics=jax")
+    if name == "c" and platform != "cpu":
+        raise UserError(f"physics=c runs on the CPU, but JAX uses a {platform}; set JAX_PLATFORMS=cpu, or use auto")
+    return name
+
+
+def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Engine:
+    """Build an engine. Engines are imported only when asked for, so that Warp stays optional.
+
+    Args:
+        name: what `resolve_engine` returned.
+        model: Gymnasium's model, unchanged.
+        num_substeps: physics steps an environment step (Gymnasium's `frame_skip`).
+        derived: the `mjData` arrays that the task reads.
+    """
+    if name == "warp":
+        from mjx_walk.envs.physics.mjx_warp import WarpEngine as EngineClass
+    elif name == "jax":
+        from mjx_walk.envs.physics.mjx_jax import JaxEngine as EngineClass
+    else:
+        from mjx_walk.envs.physics.mujoco_c import CEngine as EngineClass
+    return EngineClass(model, num_substeps, derived)

@@ -1,0 +1,71 @@
+"""The `warp` engine: MJX on MuJoCo Warp, for NVIDIA GPUs (and, slowly, for CPU tests)."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import warp as wp
+from mujoco import mjx
+
+from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
+from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
+
+CONTACTS_PER_COPY = 24
+"""Contacts a copy may hold on average over the batch; the batch shares one buffer."""
+SPARE_CONTACTS = 256
+"""Room on top, so that a small batch, whose average swings further, does not overflow."""
+CONSTRAINTS_PER_COPY = 112
+"""Constraint rows of any one copy: four for a contact with friction, one for any other and for a joint limit."""
+
+
+class WarpEngine:
+    """MuJoCo Warp in float32, called once a substep for the whole batch."""
+
+    name = "warp"
+
+    def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
+        wp.config.quiet = True
+        self._mj_model = with_newton_solver(model)
+        # Warp would print two lines an overflow; it is returned instead, and counted in the metrics.
+        self._model = mjx.put_model(self._mj_model, impl="warp", device=jax.local_devices()[0]).tree_replace(
+            {"opt._impl.warn_overflow": 0}
+        )
+        self._last_model = self._model.tree_replace(
+            {"opt._impl.run_rne_postconstraint": "cfrc_ext" in derived}
+        )
+        self._num_substeps = num_substeps
+        self._derived = derived
+        self.forward = batch_once(self._forward)
+        self.step = batch_once(self._step)
+
+    def _data(self, state: PhysicsState) -> mjx.Data:
+        """Warp's work space for the whole batch, made inside the program: nearly all zeros, never a constant."""
+        num_copies = state.qpos.shape[0]
+        with jax.ensure_compile_time_eval():
+            blank = mjx.make_data(
+                self._mj_model,
+                impl="warp",
+                device=jax.local_devices(backend="cpu")[0],
+                naconmax=CONTACTS_PER_COPY * num_copies + SPARE_CONTACTS,
+                njmax=CONSTRAINTS_PER_COPY,
+            )
+            blank = jax.tree.map(np.asarray, blank)
+        blank = jax.tree.map(lambda x: jnp.array(x) if x.any() else jnp.zeros(x.shape, x.dtype), blank)
+        return jax.vmap(lambda s: blank.replace(qpos=s.qpos, qvel=s.qvel, qacc_warmstart=s.qacc_warmstart))(state)
+
+    def _forward(self, state: PhysicsState) -> Derived:
+        return read_derived(_vmapped(mjx.forward, self._model, self._data(state)), self._derived)
+
+    def _step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Derived, jax.Array]:
+        data = self._data(state).replace(ctrl=ctrl)
+        overflow = jnp.zeros(ctrl.shape[0], bool)
+        for substep in range(self._num_substeps):
+            is_last = substep == self._num_substeps - 1
+            data = _vmapped(mjx.step, self._last_model if is_last else self._model, data)
+            # The contact buffer is shared: once it is full, any copy may have lost a contact.
+            overflow |= (data._impl.nacon > data._impl.naconmax).any() | (data._impl.nefc > data._impl.njmax)
+        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), read_derived(data, self._derived), overflow
+
+
+def _vmapped(function, model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    return jax.vmap(lambda d: function(model, d))(data)

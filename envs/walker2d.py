@@ -1,0 +1,62 @@
+"""Walker2d: run forward in a plane."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from mjx_walk.envs.physics import Derived, PhysicsState
+from mjx_walk.envs.task import Memory, State, Task, TaskOptions
+
+MAX_OBSERVED_VELOCITY = 10.0
+"""Velocities are clipped to it in the observation, m/s and rad/s."""
+
+
+@dataclasses.dataclass
+class Walker2dOptions(TaskOptions):
+    """Keywords of Gymnasium's `Walker2dEnv`."""
+
+    name: str = "walker2d"
+    frame_skip: int = 4
+    reset_noise_scale: float = 5e-3
+    forward_reward_weight: float = 1.0
+    ctrl_cost_weight: float = 1e-3
+    healthy_reward: float = 1.0
+    terminate_when_unhealthy: bool = True
+    healthy_z_range: tuple[float, float] = (0.8, 2.0)
+    healthy_angle_range: tuple[float, float] = (-1.0, 1.0)
+
+
+class Walker2d(Task):
+    """Source: `gymnasium/envs/mujoco/walker2d_v5.py` and `walker2d_v4.py`. v4's right foot has friction 0.9."""
+
+    GYMNASIUM_NAME = "Walker2d"
+    XML_FILES = {"v5": "walker2d_v5.xml", "v4": "walker2d.xml"}
+    REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_forward", "reward_ctrl", "reward_survive"))
+
+    options: Walker2dOptions
+
+    def derived_names(self) -> tuple[str, ...]:
+        return ()
+
+    def observe(self, physics: PhysicsState, derived: Derived) -> jax.Array:
+        """`[17]`: height, torso angle and six joint angles, then nine velocities, clipped."""
+        qpos = physics.qpos[1:] if self.options.exclude_current_positions_from_observation else physics.qpos
+        qvel = jnp.clip(physics.qvel, -MAX_OBSERVED_VELOCITY, MAX_OBSERVED_VELOCITY)
+        return jnp.concatenate([qpos, qvel])
+
+    def evaluate(self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array):
+        options = self.options
+        height, angle = physics.qpos[1], physics.qpos[2]
+        is_healthy = (options.healthy_z_range[0] < height) & (height < options.healthy_z_range[1])
+        is_healthy &= (options.healthy_angle_range[0] < angle) & (angle < options.healthy_angle_range[1])
+        # v4 pays the healthy reward on the step that ends the episode, too.
+        is_paid = is_healthy | (options.terminate_when_unhealthy and options.version == "v4")
+        terms = {
+            "reward_forward": options.forward_reward_weight
+            * (physics.qpos[0] - before.physics.qpos[0])
+            / self.dt,
+            "reward_ctrl": -options.ctrl_cost_weight * jnp.square(action).sum(),
+            "reward_survive": options.healthy_reward * is_paid,
+        }
+        return terms, sum(terms.values()), ~is_healthy & options.terminate_when_unhealthy
