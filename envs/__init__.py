@@ -9,6 +9,7 @@ from mjx_walk.envs.humanoid_standup import HumanoidStandup, HumanoidStandupOptio
 from mjx_walk.envs.task import State, Task, TaskOptions
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.errors import UserError
+from mjx_walk.settings import validate
 
 TASKS: dict[str, tuple[type[Task], type[TaskOptions]]] = {
     "humanoid": (Humanoid, HumanoidOptions),
@@ -39,4 +40,6 @@ def make_env(name: str, physics: str = "auto", **kwargs: Any) -> Task:
             near = difflib.get_close_matches(keyword, known, n=1)
             hint = f"did you mean '{near[0]}'? " if near else ""
             raise UserError(f"{name} has no keyword '{keyword}'; {hint}valid: {', '.join(known)}")
-    return task_class(options_class(**kwargs), physics)
+    options = options_class(**kwargs)
+    validate(options)
+    return task_class(options, physics)

@@ -13,6 +13,7 @@ import mujoco
 
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.errors import UserError
+from mjx_walk.settings import setting
 
 MAX_ABS_VALUE = 1e10
 """A position or velocity beyond it is a broken simulation, as in MuJoCo's own check (`mjMAXVAL`)."""
@@ -46,13 +47,18 @@ class TaskOptions:
     """Keywords that all tasks share. Each task's own class adds Gymnasium's, under Gymnasium's names."""
 
     name: str = ""
-    version: str = "v5"
+    version: str = setting("v5", choices=("v5", "v4"))
     xml_file: str | None = None
     """A model of your own, as in Gymnasium; by default the version's own file."""
-    frame_skip: int = 5
-    reset_noise_scale: float = 1e-2
+    frame_skip: int = setting(5, at_least=1)
+    reset_noise_scale: float = setting(1e-2, at_least=0)
     exclude_current_positions_from_observation: bool = True
-    max_episode_steps: int = 1000
+    max_episode_steps: int = setting(1000, at_least=1)
+
+    def __post_init__(self):
+        for field in dataclasses.fields(self):  # a range comes as a list from a configuration file
+            if isinstance(getattr(self, field.name), list):
+                setattr(self, field.name, tuple(getattr(self, field.name)))
 
 
 class Task(abc.ABC):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.task import Memory, State, Task, TaskOptions
+from mjx_walk.settings import setting
 
 MAX_OBSERVED_VELOCITY = 10.0
 """Velocities are clipped to it in the observation, m/s and rad/s."""
@@ -17,8 +18,8 @@ class Walker2dOptions(TaskOptions):
     """Keywords of Gymnasium's `Walker2dEnv`."""
 
     name: str = "walker2d"
-    frame_skip: int = 4
-    reset_noise_scale: float = 5e-3
+    frame_skip: int = setting(4, at_least=1)
+    reset_noise_scale: float = setting(5e-3, at_least=0)
     forward_reward_weight: float = 1.0
     ctrl_cost_weight: float = 1e-3
     healthy_reward: float = 1.0

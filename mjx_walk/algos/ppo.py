@@ -1,0 +1,282 @@
+"""Proximal policy optimisation (Schulman et al. 2017) on Brax's networks and loss."""
+
+import dataclasses
+import functools
+import math
+from typing import Any
+
+import flax
+import jax
+import jax.numpy as jnp
+import optax
+from brax.training.acme.running_statistics import RunningStatisticsState
+from brax.training.agents.ppo import losses as ppo_losses
+from brax.training.agents.ppo import networks as brax_ppo_networks
+from brax.training.networks import ACTIVATION
+
+from mjx_walk import networks, returns, rollout
+from mjx_walk.envs import Task
+from mjx_walk.errors import UserError
+from mjx_walk.schedules import anneal
+from mjx_walk.settings import setting
+from mjx_walk.types import Algorithm, Metrics, Transition
+from mjx_walk.wrappers import VectorEnv, VectorState
+
+
+@dataclasses.dataclass
+class PPOConfig:
+    """Settings of PPO; the recipe of each task changes some of them."""
+
+    name: str = "ppo"
+    unroll_length: int = setting(10, at_least=1)
+    """Steps of one trajectory piece, over which advantages are estimated."""
+    num_unrolls: int = setting(4, at_least=1)
+    """Pieces of every copy in one batch."""
+    num_minibatches: int = setting(32, at_least=1)
+    num_epochs: int = setting(8, at_least=1)
+    learning_rate: float = setting(3e-4, above=0)
+    learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
+    """`linear`: to zero over `schedule_steps`; `adaptive_kl`: kept near `target_kl`, and annealed as well."""
+    target_kl: float = setting(0.01, above=0)
+    schedule_steps: int = setting(100_000_000, at_least=1)
+    """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
+    max_policy_grad_norm: float = setting(1.0, above=0)
+    max_value_grad_norm: float | None = setting(None, above=0)
+    """By default policy and value are clipped together by `max_policy_grad_norm`, as Brax does."""
+    discount: float = setting(0.97, at_least=0, at_most=1)
+    gae_lambda: float = setting(0.95, at_least=0, at_most=1)
+    clip_epsilon: float = setting(0.3, above=0)
+    entropy_cost: float = setting(1e-3, at_least=0)
+    entropy_schedule: str = setting("constant", choices=("constant", "linear"))
+    """`linear`: to zero over `schedule_steps`."""
+    value_cost: float = setting(0.5, above=0)
+    reward_scale: float = setting(0.1, above=0)
+    normalize_rewards: bool = False
+    """Divide rewards by the running std of the discounted return, before `reward_scale`."""
+    normalize_advantages: bool = True
+    observation_clip: float | None = setting(10.0, above=0)
+    """Bound of normalised observations."""
+    policy_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 128), at_least=1)
+    value_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 256, 256), at_least=1)
+    activation: str = setting("swish", choices=tuple(ACTIVATION))
+    distribution: str = setting("tanh_normal", choices=("tanh_normal", "normal"))
+    init_noise_std: float = setting(1.0, above=0)
+    """Of the `normal` distribution only."""
+    stagger_episodes: bool = True
+
+
+@flax.struct.dataclass
+class PPOState:
+    """Everything that influences PPO's next update."""
+
+    params: ppo_losses.PPONetworkParams
+    optimizer: optax.OptState
+    learning_rate: jax.Array
+    """Of the `adaptive_kl` schedule; else constant."""
+    normalizer: RunningStatisticsState
+    return_scale: returns.ReturnScale
+    env: VectorState
+    key: jax.Array
+    updates: jax.Array
+    """`[] i32`: updates done."""
+
+
+@flax.struct.dataclass
+class PPOBatch:
+    """What one `collect` hands to `learn`; N pieces of T steps."""
+
+    transitions: Transition
+    """`[N, T, …]`; `next_observation` holds the last step's only, `[N, 1, …]`, which is all that GAE reads."""
+    reward_scale: jax.Array
+    stats: Metrics
+
+
+def make_ppo(task: Task, num_envs: int, config: PPOConfig) -> Algorithm:
+    """Build PPO for a task.
+
+    Args:
+        task: the unbatched environment.
+        num_envs: copies.
+        config: settings.
+
+    Raises:
+        UserError: the batch does not divide into the minibatches.
+    """
+    if num_envs * config.num_unrolls % config.num_minibatches:
+        divisor = config.num_minibatches // math.gcd(config.num_minibatches, config.num_unrolls)
+        raise UserError(
+            f"num_envs={num_envs} times algo.num_unrolls={config.num_unrolls} does not divide into "
+            f"algo.num_minibatches={config.num_minibatches}; choose num_envs a multiple of {divisor}"
+        )
+    env = VectorEnv(task, num_envs, stagger=config.stagger_episodes)
+    nets = networks.make_ppo_networks(task, config)
+    optimizer = _make_optimizer(config)
+    steps_per_update = num_envs * config.unroll_length * config.num_unrolls
+
+    def init(key: jax.Array) -> PPOState:
+        policy_key, value_key, env_key, key = jax.random.split(key, 4)
+        params = ppo_losses.PPONetworkParams(
+            policy=nets.policy_network.init(policy_key), value=nets.value_network.init(value_key)
+        )
+        return PPOState(
+            params=params,
+            optimizer=optimizer.init(params),
+            learning_rate=jnp.float32(config.learning_rate),
+            normalizer=networks.init_normalizer(task.observation_size),
+            return_scale=returns.init_return_scale(num_envs),
+            env=env.init(env_key),
+            key=key,
+            updates=jnp.zeros((), jnp.int32),
+        )
+
+    def collect(state: PPOState) -> tuple[PPOState, PPOBatch]:
+        key, pool_key, run_key = jax.random.split(state.key, 3)
+        sample = brax_ppo_networks.make_inference_fn(nets)((state.normalizer, state.params.policy))
+        reward_scale = jnp.float32(config.reward_scale)
+        if config.normalize_rewards:
+            reward_scale *= returns.reward_multiplier(state.return_scale)
+
+        def actor(obs, key):
+            action, extras = sample(obs, key)
+            return networks.to_env_action(task, action), extras
+
+        def lost_value(outcome, truncated):
+            """Values of observations that a time limit cut off; computed only at steps where there are any."""
+            return jax.lax.cond(
+                truncated.any(),
+                lambda obs: nets.value_network.apply(state.normalizer, state.params.value, obs),
+                lambda obs: jnp.zeros(obs.shape[0], jnp.float32),
+                outcome.obs,
+            )
+
+        def keep(step: rollout.Step):
+            outcome = step.outcome
+            truncated = outcome.truncated & ~outcome.terminated
+            value = lost_value(outcome, truncated)
+            transition = Transition(
+                observation=step.obs,
+                action=step.action,
+                reward=returns.bootstrap_truncated(outcome.reward, truncated, value, config.discount, reward_scale),
+                discount=1.0 - jnp.float32(outcome.terminated | truncated),
+                next_observation=(),
+                extras={"policy_extras": step.extras, "state_extras": {"truncation": jnp.zeros(num_envs)}},
+            )
+            return transition, outcome.reward, outcome.terminated | truncated
+
+        def piece(env_state, key):
+            env_state, kept, stats = rollout.unroll(env, env_state, actor, key, config.unroll_length, keep)
+            return env_state, (*kept, env_state.env.obs, stats)
+
+        env_state = env.renew_pool(state.env, pool_key)
+        keys = jax.random.split(run_key, config.num_unrolls)
+        env_state, (transitions, reward, done, last_obs, stats) = jax.lax.scan(piece, env_state, keys)
+        # Where an episode ended at a piece's last step, last_obs belongs to the next one: its discount is 0.
+        transitions = jax.tree.map(_pieces_first, transitions)
+        transitions = transitions._replace(next_observation=last_obs.reshape((-1, 1, last_obs.shape[-1])))
+        return_scale = returns.update_return_scale(
+            state.return_scale, reward.reshape((-1, num_envs)), done.reshape((-1, num_envs)), config.discount
+        )
+        batch = PPOBatch(transitions, reward_scale, jax.tree.map(lambda x: x.sum(0), stats))
+        return state.replace(env=env_state, return_scale=return_scale, key=key), batch
+
+    def learn(state: PPOState, batch: PPOBatch) -> tuple[PPOState, Metrics]:
+        key, update_key = jax.random.split(state.key)
+        remaining = anneal(state.updates * float(steps_per_update), config.schedule_steps)
+        is_adaptive = config.learning_rate_schedule == "adaptive_kl"
+        rate_factor = 1.0 if config.learning_rate_schedule == "constant" else remaining
+        # KL compares distributions under one normalizer, so with adaptive_kl it moves after the update.
+        new_normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
+        normalizer = state.normalizer if is_adaptive else new_normalizer
+        loss_fn = functools.partial(
+            ppo_losses.compute_ppo_loss,
+            ppo_network=nets,
+            entropy_cost=config.entropy_cost * (remaining if config.entropy_schedule == "linear" else 1.0),
+            discounting=config.discount,
+            reward_scaling=batch.reward_scale,
+            gae_lambda=config.gae_lambda,
+            clipping_epsilon=config.clip_epsilon,
+            normalize_advantage=config.normalize_advantages,
+            vf_coefficient=config.value_cost,
+        )
+
+        def minibatch(carry, rows):
+            params, opt_state, rate, key = carry
+            key, loss_key = jax.random.split(key)
+            data = jax.tree.map(lambda x: x[rows], batch.transitions)
+            grads, metrics = jax.grad(loss_fn, has_aux=True)(params, normalizer, data, loss_key)
+            if is_adaptive:
+                rate = _adapt_rate(rate, metrics["kl_mean"], config.target_kl)
+            updates, opt_state = optimizer.update(grads, opt_state)
+            updates = jax.tree.map(lambda u: -rate * rate_factor * u, updates)
+            metrics["grad_norm"] = optax.global_norm(grads)
+            return (optax.apply_updates(params, updates), opt_state, rate, key), metrics
+
+        def epoch(carry, _):
+            params, opt_state, rate, key = carry
+            key, shuffle_key, epoch_key = jax.random.split(key, 3)
+            rows = jax.random.permutation(shuffle_key, batch.transitions.reward.shape[0])
+            carry = (params, opt_state, rate, epoch_key)
+            carry, metrics = jax.lax.scan(minibatch, carry, rows.reshape((config.num_minibatches, -1)))
+            return (*carry[:3], key), metrics
+
+        carry = (state.params, state.optimizer, state.learning_rate, update_key)
+        (params, opt_state, rate, _), metrics = jax.lax.scan(epoch, carry, length=config.num_epochs)
+        new_state = state.replace(
+            params=params,
+            optimizer=opt_state,
+            learning_rate=rate,
+            normalizer=new_normalizer,
+            key=key,
+            updates=state.updates + 1,
+        )
+        learning_rate = {"learning_rate": jnp.float32(rate * rate_factor), "reward_scale": batch.reward_scale}
+        return new_state, batch.stats | _loss_metrics(metrics, config) | learning_rate
+
+    def policy(params, deterministic: bool = True):
+        act = brax_ppo_networks.make_inference_fn(nets)(params, deterministic=deterministic)
+        return lambda obs, key: networks.to_env_action(task, act(obs, key)[0])
+
+    def policy_params(state: PPOState) -> Any:
+        return (state.normalizer, state.params.policy)
+
+    return Algorithm(init, collect, learn, policy_params, policy, steps_per_update)
+
+
+def _pieces_first(x: jax.Array) -> jax.Array:
+    """`[U, T, B, …]` to `[U·B, T, …]`."""
+    x = jnp.swapaxes(x, 1, 2)
+    return x.reshape((-1, *x.shape[2:]))
+
+
+def _make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
+    """Clip and Adam, without the learning rate, which `learn` multiplies in."""
+    if config.max_value_grad_norm is None:
+        return optax.chain(optax.clip_by_global_norm(config.max_policy_grad_norm), optax.scale_by_adam())
+    parts = {
+        "policy": optax.chain(optax.clip_by_global_norm(config.max_policy_grad_norm), optax.scale_by_adam()),
+        "value": optax.chain(optax.clip_by_global_norm(config.max_value_grad_norm), optax.scale_by_adam()),
+    }
+    return optax.partition(parts, ppo_losses.PPONetworkParams(policy="policy", value="value"))
+
+
+def _adapt_rate(rate: jax.Array, kl: jax.Array, target: float) -> jax.Array:
+    """Source: rsl_rl's schedule: ÷ 1.5 above twice the target, × 1.5 below half of it, within 1e-5 and 1e-2."""
+    slower = jnp.where(kl > 2.0 * target, rate / 1.5, rate)
+    faster = jnp.where((kl < 0.5 * target) & (kl > 0.0), slower * 1.5, slower)
+    return jnp.clip(faster, 1e-5, 1e-2)
+
+
+def _loss_metrics(metrics: Metrics, config: PPOConfig) -> Metrics:
+    names = {
+        "total_loss": "loss",
+        "policy_loss": "policy_loss",
+        "v_loss": "value_loss",
+        "kl_mean": "kl",
+        "policy_dist_mean_std": "policy_std",
+        "grad_norm": "grad_norm",
+    }
+    means = {new: metrics[old].mean() for old, new in names.items()}
+    entropy_cost = config.entropy_cost
+    if entropy_cost > 0 and config.entropy_schedule == "constant":
+        means["entropy"] = -metrics["entropy_loss"].mean() / entropy_cost
+    return means

@@ -1,0 +1,151 @@
+"""What the commands, the notebook and the tests call: train a run, load a run."""
+
+import dataclasses
+import functools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from mjx_walk import run_folder
+from mjx_walk.algos import make_algorithm
+from mjx_walk.config import Config, compile_cache_dir, load_config, read_config
+from mjx_walk.envs import TASKS, Task
+from mjx_walk.envs.physics import resolve_engine
+from mjx_walk.evaluation import Scores, score_in_gymnasium, score_in_sim
+from mjx_walk.loop import Trainer
+from mjx_walk.metrics import Row, read_rows
+from mjx_walk.policies import load_best_policy
+from mjx_walk.run_folder import MAY_DIFFER, RunFolder
+
+
+class Run:
+    """A run on disk: its configuration, its metrics and its best policy."""
+
+    def __init__(self, folder: RunFolder, physics: str | None = None):
+        """
+        Args:
+            folder: of a run that has saved a policy.
+            physics: another engine than the one it was trained on.
+
+        Raises:
+            UserError: there is no usable policy.
+        """
+        self.path = folder.path
+        self.config = read_config(folder.config)
+        engine = physics or self.config.physics
+        if physics is None and engine == "c" and jax.default_backend() != "cpu":
+            engine = "auto"
+        self.task = make_task(dataclasses.replace(self.config, physics=engine))
+        self._algorithm = make_algorithm(self.task, self.config.num_envs, self.config.algo)
+        state = jax.eval_shape(self._algorithm.init, jax.random.PRNGKey(0))
+        like = jax.eval_shape(self._algorithm.policy_params, state)
+        self.policy_params, self.policy_facts = load_best_policy(folder, like)
+
+    @functools.cached_property
+    def metrics(self) -> list[Row]:
+        """All rows of `metrics.jsonl`."""
+        return read_rows(self.path / "metrics.jsonl")
+
+    @functools.cached_property
+    def _act(self) -> Callable:
+        policy = self._algorithm.policy(self.policy_params, deterministic=True)
+        return jax.jit(lambda obs: policy(obs, jax.random.PRNGKey(0)))
+
+    def policy(self, obs: np.ndarray) -> np.ndarray:
+        """The deterministic action for one observation or a batch, in Gymnasium's units on both sides.
+
+        Args:
+            obs: `[…, observation_size]`, any float dtype.
+        """
+        return np.asarray(self._act(np.asarray(obs, np.float32)))
+
+    def evaluate(self, episodes: int = 100, backend: str = "gymnasium", seed: int = 0) -> Scores:
+        """Score the policy without noise; `backend` is `gymnasium` or `sim`, the run's own engine."""
+        if backend == "gymnasium":
+            return score_in_gymnasium(self.task, self._act, episodes, seed)
+        policy = self._algorithm.policy(self.policy_params, deterministic=True)
+        return score_in_sim(self.task, policy, episodes, seed)
+
+
+def make_task(config: Config) -> Task:
+    """The unbatched environment of a configuration."""
+    return TASKS[config.env.name][0](config.env, config.physics)
+
+
+def load_run(path: str | Path, physics: str | None = None) -> Run:
+    """Load a run from its folder.
+
+    Raises:
+        UserError: no run, or no usable policy there.
+    """
+    return Run(run_folder.open_existing(path), physics)
+
+
+def resolve(overrides: list[str]) -> Config:
+    """The configuration that a command line asks for. `resume=true` with nothing but the folder takes the run's own.
+
+    Raises:
+        UserError: anything wrong in it.
+    """
+    config = load_config(overrides)
+    given = {override.partition("=")[0] for override in overrides}
+    if config.resume and config.run_dir and given <= {*MAY_DIFFER, "hardware"}:
+        saved = read_config(run_folder.open_existing(config.run_dir).config)
+        total_steps = config.total_steps if "total_steps" in given else saved.total_steps
+        return dataclasses.replace(saved, run_dir=config.run_dir, resume=True, total_steps=total_steps)
+    return config
+
+
+def train(config: Config, on_metrics: Callable[[Row], None] | None = None) -> tuple[RunFolder, str | None]:
+    """Train, then score in the real Gymnasium.
+
+    Returns:
+        The run folder, and the name of the signal that stopped the run early, if one did.
+    """
+    jax.config.update("jax_default_matmul_precision", config.matmul_precision)
+    if not jax.config.jax_compilation_cache_dir:
+        jax.config.update("jax_compilation_cache_dir", compile_cache_dir())
+    config = dataclasses.replace(config, physics=resolve_engine(config.physics))
+    task = make_task(config)
+    make_algorithm(task, config.num_envs, config.algo)  # refuses what does not fit, before a folder is made
+    folder, config = run_folder.prepare(config)
+    _announce(config, folder)
+    trainer = Trainer(config, task, folder, on_metrics)
+    signal_name = trainer.train()
+    if signal_name:
+        print(
+            f"Stopped by {signal_name} and saved. To go on: python -m mjx_walk.train run_dir={folder.path} resume=true",
+            flush=True,
+        )
+    else:
+        trainer.score()
+    return folder, signal_name
+
+
+def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | None = None) -> Run:
+    """Train as `python -m mjx_walk.train` would, from Python.
+
+    Args:
+        overrides: `["env=walker2d", "total_steps=1_000_000"]`.
+        on_metrics: called with every row that is logged.
+
+    Raises:
+        UserError: anything wrong in the overrides.
+    """
+    folder, _ = train(resolve(overrides or []), on_metrics)
+    return load_run(folder.path)
+
+
+def _announce(config: Config, folder: RunFolder) -> None:
+    device = jax.devices()[0]
+    where = f"{jax.device_count()} × {device.device_kind}" if device.platform != "cpu" else "the CPU"
+    print(f"Training {config.env.name} with {config.algo.name} on {where}, physics={config.physics}, in {folder.path}")
+    if config.hardware == "cpu":
+        print(
+            "No accelerator: the CPU-sized recipe, with MuJoCo's C library unless another engine was asked for. "
+            "Expect minutes to tens of minutes to a gait; recipes for a GPU reach much higher scores.",
+        )
+    sys.stdout.flush()

@@ -1,0 +1,53 @@
+"""What all commands share: `key=value` arguments, and one line and exit code 2 for a user's mistake."""
+
+import dataclasses
+import sys
+from collections.abc import Callable
+from typing import Any, NoReturn, TypeVar
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from mjx_walk.errors import UserError
+from mjx_walk.settings import validate
+
+Arguments = TypeVar("Arguments")
+
+
+def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Arguments:
+    """Read `key=value` arguments into a dataclass.
+
+    Args:
+        schema: dataclass with defaults; `validate` checks its ranges.
+        arguments: as on the command line.
+        usage: printed for `--help`.
+
+    Raises:
+        UserError: an unknown key, a wrong type, or a value out of range.
+    """
+    if any(argument in ("-h", "--help") for argument in arguments):
+        print(usage.strip())
+        raise SystemExit(0)
+    known = [field.name for field in dataclasses.fields(schema)]  # type: ignore[arg-type]
+    node = OmegaConf.structured(schema)
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if not equals or key not in known:
+            problem = f"unknown key '{key}'" if equals else f"cannot read '{argument}', write key=value"
+            raise UserError(f"{problem}; valid: {', '.join(known)}")
+        try:
+            OmegaConf.update(node, key, OmegaConf.from_dotlist([f"value={value}"]).value)
+        except OmegaConfBaseException as error:
+            raise UserError(f"{argument}: {str(error).splitlines()[0]}") from error
+    parsed: Any = OmegaConf.to_object(node)
+    validate(parsed)
+    return parsed
+
+
+def main(command: Callable[[list[str]], int | None]) -> NoReturn:
+    """Run a command on the process's arguments and exit with its code."""
+    try:
+        sys.exit(command(sys.argv[1:]) or 0)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

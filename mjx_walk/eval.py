@@ -1,0 +1,41 @@
+"""`python -m mjx_walk.eval run=RUN_DIR`: score a run's policy without noise."""
+
+import dataclasses
+
+from mjx_walk import cli, run_folder
+from mjx_walk.api import load_run
+from mjx_walk.errors import UserError
+from mjx_walk.settings import setting
+
+USAGE = """
+usage: python -m mjx_walk.eval run=RUN_DIR [episodes=100] [backend=gymnasium|sim] [seed=0] [physics=ENGINE]
+
+  backend=gymnasium   the real environment, on the CPU; writes eval_gymnasium.json into the run folder
+  backend=sim         the run's own engine, or another one by physics=
+"""
+
+
+@dataclasses.dataclass
+class Arguments:
+    run: str | None = None
+    episodes: int = setting(100, at_least=1)
+    backend: str = setting("gymnasium", choices=("gymnasium", "sim"))
+    seed: int = setting(0, at_least=0)
+    physics: str | None = None
+
+
+def main(arguments: list[str]) -> None:
+    """Evaluate and print."""
+    parsed = cli.parse(Arguments, arguments, USAGE)
+    if parsed.run is None:
+        raise UserError("say which run: run=RUN_DIR")
+    folder = run_folder.open_existing(parsed.run)
+    run = load_run(parsed.run, parsed.physics)
+    scores = run.evaluate(parsed.episodes, parsed.backend, parsed.seed)
+    if parsed.backend == "gymnasium":
+        scores.save(folder.gymnasium_scores, env_steps=run.policy_facts["env_steps"])
+    print(scores)
+
+
+if __name__ == "__main__":
+    cli.main(main)

@@ -1,0 +1,203 @@
+"""The only host loop: run a chunk on the device, log it, evaluate, save."""
+
+import collections
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mjx_walk import checkpoint, plots, rollout
+from mjx_walk.algos import make_algorithm
+from mjx_walk.config import Config
+from mjx_walk.envs import Task
+from mjx_walk.evaluation import score_in_gymnasium
+from mjx_walk.interrupt import Interrupt
+from mjx_walk.metrics import MetricsWriter, Progress, Row, name_metrics
+from mjx_walk.policies import load_best_policy, save_best_policy
+from mjx_walk.run_folder import RunFolder
+from mjx_walk.types import Algorithm, Metrics, TrainState
+from mjx_walk.wrappers import VectorEnv
+
+_SPEED_WINDOW = 10.0
+_EVALUATION_STREAM = 0x5EED
+"""Keeps the evaluations' random keys apart from training's."""
+
+
+def make_chunk(algorithm: Algorithm, num_updates: int, fused: bool) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
+    """Compile `num_updates` updates into one call.
+
+    Args:
+        algorithm: what to run.
+        num_updates: updates a chunk.
+        fused: collect and learn in one program. Engines that call back to the host are kept in a program of their
+            own, because JAX does not keep such programs in its compile cache.
+
+    Returns:
+        `TrainState → (TrainState, metrics [num_updates])`. The state passed in is consumed.
+    """
+
+    def update(state, _):
+        state, batch = algorithm.collect(state)
+        return algorithm.learn(state, batch)
+
+    if fused:
+        return jax.jit(lambda state: jax.lax.scan(update, state, length=num_updates), donate_argnums=0)
+
+    collect = jax.jit(algorithm.collect, donate_argnums=0)
+    learn = jax.jit(algorithm.learn, donate_argnums=0)
+
+    def chunk(state):
+        rows = []
+        for _ in range(num_updates):
+            state, metrics = learn(*collect(state))
+            rows.append(metrics)
+        return state, jax.tree.map(lambda *xs: jnp.stack(xs), *rows)
+
+    return chunk
+
+
+class Trainer:
+    """One run, from its configuration to its scores."""
+
+    def __init__(self, config: Config, task: Task, folder: RunFolder, on_metrics: Callable[[Row], None] | None = None):
+        """
+        Args:
+            config: checked configuration.
+            task: the unbatched environment.
+            folder: prepared run folder.
+            on_metrics: called with every row that is logged.
+        """
+        self.config = config
+        self.task = task
+        self.folder = folder
+        self.algorithm = make_algorithm(task, config.num_envs, config.algo)
+        self.steps_per_chunk = self.algorithm.steps_per_update * config.updates_per_chunk
+        self.num_chunks = -(-config.total_steps // self.steps_per_chunk)
+        self._chunk = make_chunk(self.algorithm, config.updates_per_chunk, fused=task.engine.name != "c")
+        self._evaluate = jax.jit(self._evaluation)
+        self._on_metrics = on_metrics or (lambda row: None)
+        self._started = time.monotonic()
+        self._times: collections.deque[tuple[float, int]] = collections.deque()
+        self._seconds_before = 0.0
+        self._best_return = -float("inf")
+
+    def train(self) -> str | None:
+        """Train to the end, or until a signal asks to stop.
+
+        Returns:
+            None at the end, else the name of the signal; the state is saved either way.
+        """
+        state, first_chunk = self._start()
+        writer = MetricsWriter(self.folder.path, first_chunk * self.steps_per_chunk if self.config.resume else None)
+        self._times.append((time.monotonic(), first_chunk))
+        progress = Progress(self.num_chunks * self.steps_per_chunk, first_chunk * self.steps_per_chunk)
+        saved_chunk = first_chunk if self.config.resume else -1
+        pending: tuple[int, Metrics, Metrics | None] | None = None
+        chunk = first_chunk
+
+        def log(entry):
+            row = self._row(*entry)
+            writer.write(row)
+            progress.update(row)
+            self._on_metrics(row)
+
+        with Interrupt() as interrupt:
+            while chunk < self.num_chunks and not interrupt.signal_name:
+                state, metrics = self._chunk(state)
+                chunk += 1
+                is_last = chunk == self.num_chunks
+                scores = None
+                if chunk % self.config.evaluation.every_chunks == 0 or is_last:
+                    scores = self._evaluate(self.algorithm.policy_params(state), chunk)
+                # The row of the chunk before is fetched while this one runs.
+                if pending:
+                    log(pending)
+                pending = (chunk, metrics, scores)
+                if scores is not None:
+                    log(pending)
+                    pending = None
+                    self._keep_if_best(state, scores, chunk)
+                if chunk % self.config.checkpoint.every_chunks == 0 or is_last:
+                    self._save(state, chunk)
+                    saved_chunk = chunk
+            if pending:
+                log(pending)
+            if saved_chunk != chunk:
+                self._save(state, chunk)
+        progress.close()
+        writer.close()
+        plots.plot_run(self.folder.path)
+        return interrupt.signal_name
+
+    def score(self) -> None:
+        """Evaluate the best policy in the real Gymnasium, and write `eval_gymnasium.json`."""
+        num_episodes = self.config.evaluation.gymnasium_episodes
+        if not num_episodes:
+            return
+        params, meta = load_best_policy(self.folder, self._policy_like())
+        act = jax.jit(lambda obs: self.algorithm.policy(params, deterministic=True)(obs, jax.random.PRNGKey(0)))
+        scores = score_in_gymnasium(self.task, act, num_episodes)
+        scores.save(self.folder.gymnasium_scores, env_steps=meta["env_steps"], wall_seconds=self._seconds())
+        print(f"In the real Gymnasium, {scores}", flush=True)
+
+    def _start(self) -> tuple[TrainState, int]:
+        """The TrainState to begin with, and the number of chunks behind it."""
+        init = jax.jit(self.algorithm.init)
+        key = jax.random.PRNGKey(self.config.seed)
+        if not self.config.resume:
+            return _strong(init(key)), 0
+        state, meta = checkpoint.restore_newest(self.folder.checkpoints, jax.eval_shape(init, key))
+        self._seconds_before = meta["wall_seconds"]
+        self._best_return = meta["best_return"]
+        return state, meta["env_steps"] // self.steps_per_chunk
+
+    def _policy_like(self) -> Any:
+        state = jax.eval_shape(self.algorithm.init, jax.random.PRNGKey(0))
+        return jax.eval_shape(self.algorithm.policy_params, state)
+
+    def _evaluation(self, policy_params: Any, chunk: jax.Array) -> Metrics:
+        env = VectorEnv(self.task, self.config.evaluation.num_envs)
+        key = jax.random.fold_in(jax.random.PRNGKey(self.config.seed ^ _EVALUATION_STREAM), chunk)
+        returns, lengths = rollout.evaluate(env, self.algorithm.policy(policy_params, deterministic=True), key)
+        return {"return": returns.mean(), "return_std": returns.std(), "length": lengths.mean()}
+
+    def _row(self, chunk: int, metrics: Metrics, scores: Metrics | None) -> Row:
+        row = name_metrics(jax.device_get(metrics), self.task.reward_terms)
+        row["speed/steps_per_second"] = self._speed(chunk)
+        if scores is not None:
+            row |= {f"eval/{name}": float(value) for name, value in scores.items()}
+        return {"env_steps": chunk * self.steps_per_chunk, "wall_seconds": self._seconds(), **row}
+
+    def _speed(self, chunk: int) -> float:
+        """Steps per second over the last `_SPEED_WINDOW` seconds or so, evaluation and saving included."""
+        now = time.monotonic()
+        while len(self._times) > 1 and now - self._times[1][0] > _SPEED_WINDOW:
+            self._times.popleft()
+        then, chunk_then = self._times[0]
+        self._times.append((now, chunk))
+        return (chunk - chunk_then) * self.steps_per_chunk / max(now - then, 1e-9)
+
+    def _seconds(self) -> float:
+        return self._seconds_before + time.monotonic() - self._started
+
+    def _keep_if_best(self, state: TrainState, scores: Metrics, chunk: int) -> None:
+        score = float(scores["return"])
+        if score > self._best_return:
+            self._best_return = score
+            facts = {"env_steps": chunk * self.steps_per_chunk, "eval_return": score}
+            save_best_policy(self.folder, self.algorithm.policy_params(state), facts)
+
+    def _save(self, state: TrainState, chunk: int) -> None:
+        env_steps = chunk * self.steps_per_chunk
+        facts = {"env_steps": env_steps, "wall_seconds": self._seconds(), "best_return": self._best_return}
+        checkpoint.save(checkpoint.step_path(self.folder.checkpoints, env_steps), state, facts)
+        checkpoint.prune(self.folder.checkpoints, self.config.checkpoint.keep)
+        if not self.folder.best_policy.exists():
+            save_best_policy(self.folder, self.algorithm.policy_params(state), facts | {"eval_return": None})
+
+
+def _strong(tree: Any) -> Any:
+    """Drop weak types, with which the first chunk would be compiled a second time."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), tree)

@@ -1,0 +1,126 @@
+"""From the device's sums to named metrics, and where they are written."""
+
+import json
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from tensorboardX import SummaryWriter
+from tqdm import tqdm
+
+from mjx_walk.types import Metrics
+
+Row = dict[str, float]
+"""One line of `metrics.jsonl`; see `name_metrics` for the names."""
+
+_SUMS = ("nonfinite", "overflow", "resets", "resets_reused")
+_SECONDS_BETWEEN_LINES = 10.0
+"""Where there is no terminal, progress is a plain line this often."""
+
+
+def name_metrics(metrics: Metrics, reward_terms: tuple[str, ...]) -> Row:
+    """Turn the metrics of one chunk into a log row.
+
+    Args:
+        metrics: `[updates] f32` each: the sums of `VectorEnv.step`, and the learner's means.
+        reward_terms: which of them are reward terms.
+
+    Returns:
+        `episode/…`: means over the episodes that ended (absent if none did); `physics/…` and `resets/…`: counts;
+        `train/…`: the learner's.
+    """
+    values = {name: np.asarray(value, np.float64) for name, value in metrics.items()}
+    episodes = values.pop("episodes").sum()
+    row: Row = {"episode/count": float(episodes)}
+    for name in ("return", "length", *reward_terms):
+        total = values.pop(name).sum()
+        if episodes:
+            row[f"episode/{name}"] = float(total / episodes)
+    counts = {name: float(values.pop(name).sum()) for name in _SUMS}
+    row["physics/nonfinite"] = counts["nonfinite"]
+    row["physics/overflow"] = counts["overflow"]
+    row["resets/count"] = counts["resets"]
+    row["resets/reuse_rate"] = counts["resets_reused"] / max(counts["resets"], 1.0)
+    return row | {f"train/{name}": float(value.mean()) for name, value in values.items()}
+
+
+class MetricsWriter:
+    """Appends rows to `metrics.jsonl` and to TensorBoard's event file."""
+
+    def __init__(self, run_dir: Path, resume_steps: int | None = None):
+        """
+        Args:
+            run_dir: the run folder.
+            resume_steps: where the run resumes; rows written after that by the interrupted run are dropped.
+        """
+        path = run_dir / "metrics.jsonl"
+        if resume_steps is not None:
+            rows = [row for row in read_rows(path) if row["env_steps"] <= resume_steps]
+            path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        self._file = path.open("a", buffering=1)
+        self._events = SummaryWriter(
+            str(run_dir), flush_secs=30, purge_step=None if resume_steps is None else resume_steps + 1
+        )
+
+    def write(self, row: Row) -> None:
+        """Write one row; `env_steps` is its place on the horizontal axis."""
+        self._file.write(json.dumps({k: v if math.isfinite(v) else None for k, v in row.items()}) + "\n")
+        for name, value in row.items():
+            if "/" in name:
+                self._events.add_scalar(name, value, int(row["env_steps"]))
+
+    def close(self) -> None:
+        self._file.close()
+        self._events.close()
+
+
+def read_rows(path: Path) -> list[Row]:
+    """All rows of a `metrics.jsonl`; a last line cut off by a crash is left out."""
+    if not path.exists():
+        return []
+    rows = []
+    for line in path.read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return rows
+
+
+class Progress:
+    """A progress bar with steps, steps/s, return, episode length and time left; plain lines without a terminal."""
+
+    def __init__(self, total_steps: int, done_steps: int):
+        self._total = total_steps
+        self._is_terminal = sys.stderr.isatty()
+        self._bar = tqdm(
+            total=total_steps, initial=done_steps, unit="step", unit_scale=True, disable=not self._is_terminal
+        )
+        self._last_line = -math.inf
+
+    def update(self, row: Row) -> None:
+        """Show a row."""
+        facts = {
+            "return": row.get("episode/return"),
+            "length": row.get("episode/length"),
+            "eval": row.get("eval/return"),
+        }
+        shown = {name: f"{value:,.0f}" for name, value in facts.items() if value is not None}
+        if self._is_terminal:
+            self._bar.set_postfix(shown, refresh=False)
+            self._bar.update(int(row["env_steps"]) - self._bar.n)
+        elif "eval/return" in row or time.monotonic() - self._last_line > _SECONDS_BETWEEN_LINES:
+            self._last_line = time.monotonic()
+            left = (self._total - row["env_steps"]) / max(row["speed/steps_per_second"], 1e-9)
+            text = "  ".join(f"{name} {value}" for name, value in shown.items())
+            rate = row["speed/steps_per_second"]
+            print(
+                f"{row['env_steps']:>13,.0f} steps  {rate:>9,.0f}/s  {text}  {max(left, 0):,.0f} s left",
+                file=sys.stderr,
+                flush=True,
+            )
+
+    def close(self) -> None:
+        self._bar.close()

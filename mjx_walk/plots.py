@@ -1,0 +1,67 @@
+"""Learning curves of a run, as PNG files in its folder."""
+
+from pathlib import Path
+
+import matplotlib.figure
+
+from mjx_walk.metrics import Row, read_rows
+
+_AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))
+
+
+def plot_run(run_dir: Path) -> list[Path]:
+    """Draw the curves that `metrics.jsonl` holds.
+
+    Returns:
+        `learning_curve.png` (return and episode length against steps and wall-clock), `reward_terms.png` and
+        `losses.png`; none where nothing was logged.
+    """
+    rows = read_rows(run_dir / "metrics.jsonl")
+    if not rows:
+        return []
+    terms = sorted({k for row in rows for k in row if k.startswith("episode/reward_")})
+    losses = sorted({k for row in rows for k in row if k.startswith("train/")})
+    return [
+        _learning_curve(rows, run_dir / "learning_curve.png"),
+        _grid(rows, terms, "per episode", run_dir / "reward_terms.png"),
+        _grid(rows, losses, "", run_dir / "losses.png"),
+    ]
+
+
+def _series(rows: list[Row], x: str, y: str) -> tuple[list[float], list[float]]:
+    pairs = [(row[x], row[y]) for row in rows if row.get(y) is not None]
+    return [p[0] for p in pairs], [p[1] for p in pairs]
+
+
+def _learning_curve(rows: list[Row], path: Path) -> Path:
+    figure = matplotlib.figure.Figure(figsize=(10, 6.5), layout="constrained")
+    grid = figure.subplots(2, 2, sharex="col")
+    for column, (axis, unit, label) in enumerate(_AXES):
+        for line, (quantity, title) in enumerate((("return", "return"), ("length", "episode length"))):
+            plot = grid[line][column]
+            for source, style in (("episode", {"alpha": 0.6}), ("eval", {"marker": "o", "markersize": 4})):
+                xs, ys = _series(rows, axis, f"{source}/{quantity}")
+                if xs:
+                    name = {"episode": "while training", "eval": "deterministic evaluation"}[source]
+                    plot.plot([x / unit for x in xs], ys, label=name, **style)
+            plot.set_ylabel(title)
+            plot.grid(alpha=0.3)
+        grid[1][column].set_xlabel(label)
+    grid[0][0].legend()
+    figure.savefig(path, dpi=110)
+    return path
+
+
+def _grid(rows: list[Row], names: list[str], ylabel: str, path: Path) -> Path:
+    columns = min(len(names), 4) or 1
+    lines = -(-len(names) // columns) or 1
+    figure = matplotlib.figure.Figure(figsize=(3.4 * columns, 2.4 * lines), layout="constrained")
+    for plot, name in zip(figure.subplots(lines, columns, squeeze=False).flat, names, strict=False):
+        xs, ys = _series(rows, "env_steps", name)
+        plot.plot([x / 1e6 for x in xs], ys)
+        plot.set_title(name.partition("/")[2], fontsize=9)
+        plot.set_xlabel("million steps", fontsize=8)
+        plot.set_ylabel(ylabel, fontsize=8)
+        plot.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+    return path

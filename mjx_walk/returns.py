@@ -1,0 +1,67 @@
+"""Discounted sums: pure maths on `[T, B]` arrays."""
+
+import flax
+import jax
+import jax.numpy as jnp
+
+
+def bootstrap_truncated(
+    reward: jax.Array, truncated: jax.Array, next_value: jax.Array, discount: float, reward_scale: jax.Array | float
+) -> jax.Array:
+    """Fold the value lost at a time limit into the reward of the step that met it.
+
+    After this a truncated step can be handled like a terminated one: the future it was cut off from is already paid.
+
+    Args:
+        reward: unscaled.
+        truncated: bool, true only where the episode did not also terminate.
+        next_value: value of the true next observation, on the scale of the scaled rewards.
+        discount: γ.
+        reward_scale: what the learner will multiply rewards by.
+
+    Returns:
+        Unscaled rewards: `r + γ V(s') / scale` where truncated, `r` elsewhere.
+    """
+    return reward + jnp.where(truncated, discount * next_value / reward_scale, 0.0)
+
+
+@flax.struct.dataclass
+class ReturnScale:
+    """Running variance of the discounted return, by which rewards may be normalised.
+
+    Source: `VecNormalize` of Stable-Baselines3 (`r / std(G)`, with `G ← γ G + r` running through each copy).
+    """
+
+    running_return: jax.Array
+    """`[B] f32`."""
+    count: jax.Array
+    mean: jax.Array
+    variance: jax.Array
+
+
+def init_return_scale(num_envs: int) -> ReturnScale:
+    """Unit scale, nothing seen yet."""
+    return ReturnScale(jnp.zeros(num_envs), jnp.float32(1e-4), jnp.float32(0.0), jnp.float32(1.0))
+
+
+def update_return_scale(scale: ReturnScale, reward: jax.Array, done: jax.Array, discount: float) -> ReturnScale:
+    """Take a chronological `[T, B]` block of rewards into the running variance."""
+
+    def advance(running, inputs):
+        reward, done = inputs
+        running = discount * running + reward
+        return jnp.where(done, 0.0, running), running
+
+    running, returns = jax.lax.scan(advance, scale.running_return, (reward, done))
+    batch_count = jnp.float32(returns.size)
+    count = scale.count + batch_count
+    delta = returns.mean() - scale.mean
+    mean = scale.mean + delta * batch_count / count
+    squares = scale.variance * scale.count + returns.var() * batch_count
+    variance = (squares + delta**2 * scale.count * batch_count / count) / count
+    return ReturnScale(running, count, mean, variance)
+
+
+def reward_multiplier(scale: ReturnScale) -> jax.Array:
+    """`1 / std(G)`."""
+    return jax.lax.rsqrt(scale.variance + 1e-8)

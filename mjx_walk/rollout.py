@@ -1,0 +1,86 @@
+"""Run a policy: collect training data, or evaluate."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjx_walk.types import Metrics, PolicyFn
+from mjx_walk.wrappers import Outcome, VectorEnv, VectorState
+
+Actor = Callable[[jax.Array, jax.Array], tuple[jax.Array, Any]]
+"""`(obs [B, …], key) → (action [B, action_size] in Gymnasium's units, extras)`."""
+
+
+class Step(NamedTuple):
+    """One step of all copies, `[B, …]`; stacked over time, `[T, B, …]`."""
+
+    obs: jax.Array
+    action: jax.Array
+    outcome: Outcome
+    extras: Any
+
+
+def unroll(
+    env: VectorEnv,
+    state: VectorState,
+    actor: Actor,
+    key: jax.Array,
+    num_steps: int,
+    keep: Callable[[Step], Any],
+) -> tuple[VectorState, Any, Metrics]:
+    """Step all copies `num_steps` times.
+
+    Args:
+        env: the copies.
+        state: where they are.
+        actor: chooses actions.
+        key: random key.
+        num_steps: T.
+        keep: what of each step to store; whatever it drops takes no memory.
+
+    Returns:
+        The copies' next state; what was kept, `[T, B, …]`; and the sums of `VectorEnv.step` over all steps.
+    """
+
+    def one(state, key):
+        obs = state.env.obs
+        action, extras = actor(obs, key)
+        state, outcome, stats = env.step(state, action)
+        return state, (keep(Step(obs, action, outcome, extras)), stats)
+
+    state, (kept, stats) = jax.lax.scan(one, state, jax.random.split(key, num_steps))
+    return state, kept, jax.tree.map(lambda x: x.sum(0), stats)
+
+
+def evaluate(env: VectorEnv, policy: PolicyFn, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """One whole episode of each copy.
+
+    Args:
+        env: copies that are not staggered.
+        policy: usually deterministic.
+        key: starts and, if the policy draws, actions.
+
+    Returns:
+        Undiscounted returns `[B] f32` and lengths `[B] i32`.
+    """
+    reset_key, run_key = jax.random.split(key)
+    start = jax.vmap(env.task.reset)(jax.random.split(reset_key, env.num_envs))
+
+    def one(carry, key):
+        state, alive, returns, lengths = carry
+        state = jax.vmap(env.task.step)(state, policy(state.obs, key))
+        returns += jnp.where(alive, state.reward, 0.0)
+        lengths += alive
+        return (state, alive & ~state.terminated, returns, lengths), None
+
+    carry = (
+        start,
+        jnp.ones(env.num_envs, bool),
+        jnp.zeros(env.num_envs, jnp.float32),
+        jnp.zeros(env.num_envs, jnp.int32),
+    )
+    keys = jax.random.split(run_key, env.task.options.max_episode_steps)
+    (_, _, returns, lengths), _ = jax.lax.scan(one, carry, keys)
+    return returns, lengths

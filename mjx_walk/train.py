@@ -1,0 +1,58 @@
+"""`python -m mjx_walk.train env=humanoid algo=ppo`: train one run, or a sweep with `-m`."""
+
+import os
+import sys
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, open_dict
+
+from mjx_walk import cli
+from mjx_walk.api import resolve, train
+from mjx_walk.config import CONFIG_DIR, complete_overrides, register_schemas, to_config
+from mjx_walk.interrupt import exit_code
+
+USAGE = """
+usage: python -m mjx_walk.train [env=humanoid|humanoid_standup|walker2d] [algo=ppo] [KEY=VALUE ...]
+
+  physics=auto|warp|jax|c   num_envs=N   total_steps=N   seed=N   run_dir=PATH   resume=true
+  recipe=PATH_BELOW_configs/recipe        another recipe than the one for the environment and the hardware
+  env.KEY=VALUE                           Gymnasium's keywords, and version=v4 as env.version=v4
+  algo.KEY=VALUE                          the algorithm's settings
+  -m seed=0,1,2                           a sweep, by Hydra; its launchers work
+  --cfg job                               print the configuration and stop
+"""
+
+
+def main(arguments: list[str]) -> int:
+    """Train. Returns the exit code."""
+    if any(argument in ("-h", "--help") for argument in arguments):
+        print(USAGE.strip())
+        return 0
+    if any(argument.startswith("-") for argument in arguments):
+        _through_hydra(arguments)
+        return 0
+    _, signal_name = train(resolve(arguments))
+    return exit_code(signal_name) if signal_name else 0
+
+
+def _through_hydra(arguments: list[str]) -> None:
+    """Hand flags to Hydra: sweeps, launchers, `--cfg`."""
+    flags = [argument for argument in arguments if argument.startswith("-")]
+    overrides = [argument for argument in arguments if not argument.startswith("-")]
+    sys.argv = [sys.argv[0], *flags, *complete_overrides(overrides)]
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    register_schemas()
+    hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")(_sweep_job)()
+
+
+def _sweep_job(node: DictConfig) -> None:
+    """One job of a sweep, in its own folder. It raises on error: exiting would end the other jobs too."""
+    if node.run_dir is None:
+        with open_dict(node):
+            node.run_dir = HydraConfig.get().runtime.output_dir
+    train(to_config(node))
+
+
+if __name__ == "__main__":
+    cli.main(main)
