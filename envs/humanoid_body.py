@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.task import Task, TaskOptions
@@ -60,16 +61,24 @@ class HumanoidBody(Task):
         # The contact cost needs cfrc_ext even where it is not observed.
         return tuple(dict.fromkeys((*self.observed_arrays(), "cfrc_ext")))
 
+    def _first_row(self, name: str) -> int:
+        if self.options.version == "v4":
+            return 0
+        return NUM_ROOT_DOFS if name == "qfrc_actuator" else 1
+
+    def observation_blocks(self) -> dict[str, int]:
+        blank = mujoco.MjData(self.model)
+        blocks = {"qpos": self.model.nq - 2 * self.options.exclude_current_positions_from_observation}
+        blocks["qvel"] = self.model.nv
+        return blocks | {name: getattr(blank, name)[self._first_row(name) :].size for name in self.observed_arrays()}
+
     def observe(self, physics: PhysicsState, derived: Derived) -> jax.Array:
         """`[348]` in v5: positions without x, y (22), velocities (23), then per body `cinert` (130), `cvel` (78),
         motor torques (17) and contact forces `cfrc_ext` (78).
 
         v4 keeps the world body's zero rows and the root's zero torques: `[376]`.
         """
-        is_v4 = self.options.version == "v4"
-        first_row = {name: 0 if is_v4 else 1 for name in ("cinert", "cvel", "cfrc_ext")}
-        first_row["qfrc_actuator"] = 0 if is_v4 else NUM_ROOT_DOFS
-        blocks = [derived[name][first_row[name] :].ravel() for name in self.observed_arrays()]
+        blocks = [derived[name][self._first_row(name) :].ravel() for name in self.observed_arrays()]
         qpos = physics.qpos[2:] if self.options.exclude_current_positions_from_observation else physics.qpos
         return jnp.concatenate([qpos, physics.qvel, *blocks])
 

@@ -96,7 +96,7 @@ class Task(abc.ABC):
         self.metric_names = (*self.reward_terms, "nonfinite", "overflow")
         self.init_qpos = jnp.asarray(self.model.qpos0, jnp.float32)
         self.init_qvel = jnp.zeros(self.model.nv, jnp.float32)
-        self.observation_size = jax.eval_shape(self.reset, jax.random.PRNGKey(0)).obs.shape[0]
+        self.observation_size = sum(self.observation_blocks().values())
 
     @property
     def gymnasium_id(self) -> str:
@@ -121,6 +121,10 @@ class Task(abc.ABC):
     @abc.abstractmethod
     def derived_names(self) -> tuple[str, ...]:
         """The `mjData` arrays that `observe` and `evaluate` read."""
+
+    @abc.abstractmethod
+    def observation_blocks(self) -> dict[str, int]:
+        """The observation's parts by their `mjData` names, in order, with their sizes."""
 
     @abc.abstractmethod
     def observe(self, physics: PhysicsState, derived: Derived) -> jax.Array:

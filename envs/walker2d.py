@@ -40,6 +40,10 @@ class Walker2d(Task):
     def derived_names(self) -> tuple[str, ...]:
         return ()
 
+    def observation_blocks(self) -> dict[str, int]:
+        skipped = int(self.options.exclude_current_positions_from_observation)
+        return {"qpos": self.model.nq - skipped, "qvel": self.model.nv}
+
     def observe(self, physics: PhysicsState, derived: Derived) -> jax.Array:
         """`[17]`: height, torso angle and six joint angles, then nine velocities, clipped."""
         qpos = physics.qpos[1:] if self.options.exclude_current_positions_from_observation else physics.qpos

@@ -39,7 +39,9 @@ class Run:
         if physics is None and engine == "c" and jax.default_backend() != "cpu":
             engine = "auto"
         self.task = make_task(dataclasses.replace(self.config, physics=engine))
-        self._algorithm = make_algorithm(self.task, self.config.num_envs, self.config.algo)
+        self._algorithm = make_algorithm(
+            self.task, self.config.num_envs, self.config.evaluation.num_envs, self.config.algo
+        )
         state = jax.eval_shape(self._algorithm.init, jax.random.PRNGKey(0))
         like = jax.eval_shape(self._algorithm.policy_params, state)
         self.policy_params, self.policy_facts = load_best_policy(folder, like)
@@ -110,7 +112,7 @@ def train(config: Config, on_metrics: Callable[[Row], None] | None = None) -> tu
         jax.config.update("jax_compilation_cache_dir", compile_cache_dir())
     config = dataclasses.replace(config, physics=resolve_engine(config.physics))
     task = make_task(config)
-    make_algorithm(task, config.num_envs, config.algo)  # refuses what does not fit, before a folder is made
+    make_algorithm(task, config.num_envs, config.evaluation.num_envs, config.algo)  # refuses what does not fit, before a folder is made
     folder, config = run_folder.prepare(config)
     _announce(config, folder)
     trainer = Trainer(config, task, folder, on_metrics)

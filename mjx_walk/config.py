@@ -29,10 +29,8 @@ CONFIG_DIR = str(Path(__file__).parent / "configs")
 class EvaluationConfig:
     """Deterministic evaluation."""
 
-    every_chunks: int = setting(10, at_least=1)
-    """Chunks between two evaluations in the run's own engine."""
     num_envs: int = setting(128, at_least=1)
-    """Episodes of one such evaluation, run side by side."""
+    """Copies that run whole episodes without noise beside those that learn."""
     gymnasium_episodes: int = setting(100, at_least=0)
     """Episodes in the real Gymnasium after training; 0 leaves it out."""
 

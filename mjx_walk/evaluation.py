@@ -18,7 +18,6 @@ import mjx_walk
 from mjx_walk.envs import Task
 from mjx_walk.rollout import evaluate
 from mjx_walk.types import PolicyFn
-from mjx_walk.wrappers import VectorEnv
 
 _PACKAGES = ("gymnasium", "mujoco", "mujoco-mjx", "warp-lang", "jax", "brax", "numpy")
 
@@ -117,7 +116,6 @@ def score_in_gymnasium(
 
 def score_in_sim(task: Task, policy: PolicyFn, num_episodes: int, seed: int = 0) -> Scores:
     """Whole episodes in the task's own engine, all side by side."""
-    env = VectorEnv(task, num_episodes)
-    returns, lengths = jax.jit(lambda key: evaluate(env, policy, key))(jax.random.PRNGKey(seed))
+    returns, lengths = jax.jit(lambda key: evaluate(task, num_episodes, policy, key))(jax.random.PRNGKey(seed))
     name = f"{task.gymnasium_id} on {task.engine.name}"
     return Scores(np.asarray(returns, np.float64), np.asarray(lengths, np.int64), [seed], name)

@@ -1,6 +1,7 @@
 """The only host loop: run a chunk on the device, log it, evaluate, save."""
 
 import collections
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -8,21 +9,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_walk import checkpoint, plots, rollout
+from mjx_walk import checkpoint, plots
 from mjx_walk.algos import make_algorithm
 from mjx_walk.config import Config
 from mjx_walk.envs import Task
-from mjx_walk.evaluation import score_in_gymnasium
+from mjx_walk.evaluation import Scores, score_in_gymnasium
 from mjx_walk.interrupt import Interrupt
 from mjx_walk.metrics import MetricsWriter, Progress, Row, name_metrics
 from mjx_walk.policies import load_best_policy, save_best_policy
 from mjx_walk.run_folder import RunFolder
 from mjx_walk.types import Algorithm, Metrics, TrainState
-from mjx_walk.wrappers import VectorEnv
 
 _SPEED_WINDOW = 10.0
-_EVALUATION_STREAM = 0x5EED
-"""Keeps the evaluations' random keys apart from training's."""
+"""Seconds that the logged speed is averaged over."""
 
 
 def make_chunk(algorithm: Algorithm, num_updates: int, fused: bool) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
@@ -72,11 +71,10 @@ class Trainer:
         self.config = config
         self.task = task
         self.folder = folder
-        self.algorithm = make_algorithm(task, config.num_envs, config.algo)
+        self.algorithm = make_algorithm(task, config.num_envs, config.evaluation.num_envs, config.algo)
         self.steps_per_chunk = self.algorithm.steps_per_update * config.updates_per_chunk
         self.num_chunks = -(-config.total_steps // self.steps_per_chunk)
         self._chunk = make_chunk(self.algorithm, config.updates_per_chunk, fused=task.engine.name != "c")
-        self._evaluate = jax.jit(self._evaluation)
         self._on_metrics = on_metrics or (lambda row: None)
         self._started = time.monotonic()
         self._times: collections.deque[tuple[float, int]] = collections.deque()
@@ -89,16 +87,15 @@ class Trainer:
         Returns:
             None at the end, else the name of the signal; the state is saved either way.
         """
-        state, first_chunk = self._start()
-        writer = MetricsWriter(self.folder.path, first_chunk * self.steps_per_chunk if self.config.resume else None)
-        self._times.append((time.monotonic(), first_chunk))
-        progress = Progress(self.num_chunks * self.steps_per_chunk, first_chunk * self.steps_per_chunk)
-        saved_chunk = first_chunk if self.config.resume else -1
-        pending: tuple[int, Metrics, Metrics | None] | None = None
-        chunk = first_chunk
+        state, chunk = self._start()
+        writer = MetricsWriter(self.folder.path, chunk * self.steps_per_chunk if self.config.resume else None)
+        progress = Progress(self.num_chunks * self.steps_per_chunk, chunk * self.steps_per_chunk)
+        saved_chunk = chunk if self.config.resume else -1
+        self._times.append((time.monotonic(), chunk))
+        pending: tuple[int, Metrics] | None = None
 
-        def log(entry):
-            row = self._row(*entry)
+        def log(chunk: int, metrics: Metrics) -> None:
+            row = self._row(chunk, metrics)
             writer.write(row)
             progress.update(row)
             self._on_metrics(row)
@@ -106,41 +103,47 @@ class Trainer:
         with Interrupt() as interrupt:
             while chunk < self.num_chunks and not interrupt.signal_name:
                 state, metrics = self._chunk(state)
+                if pending:  # fetched while the next chunk runs
+                    log(*pending)
                 chunk += 1
-                is_last = chunk == self.num_chunks
-                scores = None
-                if chunk % self.config.evaluation.every_chunks == 0 or is_last:
-                    scores = self._evaluate(self.algorithm.policy_params(state), chunk)
-                # The row of the chunk before is fetched while this one runs.
-                if pending:
-                    log(pending)
-                pending = (chunk, metrics, scores)
-                if scores is not None:
-                    log(pending)
-                    pending = None
-                    self._keep_if_best(state, scores, chunk)
-                if chunk % self.config.checkpoint.every_chunks == 0 or is_last:
+                pending = (chunk, metrics)
+                if chunk % self.config.checkpoint.every_chunks == 0:
                     self._save(state, chunk)
                     saved_chunk = chunk
             if pending:
-                log(pending)
+                log(*pending)
             if saved_chunk != chunk:
                 self._save(state, chunk)
         progress.close()
         writer.close()
         plots.plot_run(self.folder.path)
+        self._last_policy = self.algorithm.policy_params(state)
         return interrupt.signal_name
 
     def score(self) -> None:
-        """Evaluate the best policy in the real Gymnasium, and write `eval_gymnasium.json`."""
+        """Score the last policy in the real Gymnasium, and write `eval_gymnasium.json`.
+
+        Where an earlier one did better in the evaluations beside training, that one is scored too, and the better
+        of the two is kept.
+        """
         num_episodes = self.config.evaluation.gymnasium_episodes
         if not num_episodes:
             return
-        params, meta = load_best_policy(self.folder, self._policy_like())
-        act = jax.jit(lambda obs: self.algorithm.policy(params, deterministic=True)(obs, jax.random.PRNGKey(0)))
-        scores = score_in_gymnasium(self.task, act, num_episodes)
-        scores.save(self.folder.gymnasium_scores, env_steps=meta["env_steps"], wall_seconds=self._seconds())
+        facts = {"env_steps": self.num_chunks * self.steps_per_chunk}
+        scores = self._score_in_gymnasium(self._last_policy, num_episodes)
+        if self._best_return > scores.mean:
+            params, best_facts = load_best_policy(self.folder, self._last_policy)
+            best_scores = self._score_in_gymnasium(params, num_episodes)
+            if best_scores.mean > scores.mean:
+                scores, facts = best_scores, best_facts
+        if facts["env_steps"] == self.num_chunks * self.steps_per_chunk:
+            save_best_policy(self.folder, self._last_policy, facts)
+        scores.save(self.folder.gymnasium_scores, env_steps=facts["env_steps"], wall_seconds=self._seconds())
         print(f"In the real Gymnasium, {scores}", flush=True)
+
+    def _score_in_gymnasium(self, policy_params: Any, num_episodes: int) -> Scores:
+        policy = self.algorithm.policy(policy_params, deterministic=True)
+        return score_in_gymnasium(self.task, jax.jit(lambda obs: policy(obs, jax.random.PRNGKey(0))), num_episodes)
 
     def _start(self) -> tuple[TrainState, int]:
         """The TrainState to begin with, and the number of chunks behind it."""
@@ -150,24 +153,12 @@ class Trainer:
             return _strong(init(key)), 0
         state, meta = checkpoint.restore_newest(self.folder.checkpoints, jax.eval_shape(init, key))
         self._seconds_before = meta["wall_seconds"]
-        self._best_return = meta["best_return"]
+        self._best_return = float(state.env.live.best_return)
         return state, meta["env_steps"] // self.steps_per_chunk
 
-    def _policy_like(self) -> Any:
-        state = jax.eval_shape(self.algorithm.init, jax.random.PRNGKey(0))
-        return jax.eval_shape(self.algorithm.policy_params, state)
-
-    def _evaluation(self, policy_params: Any, chunk: jax.Array) -> Metrics:
-        env = VectorEnv(self.task, self.config.evaluation.num_envs)
-        key = jax.random.fold_in(jax.random.PRNGKey(self.config.seed ^ _EVALUATION_STREAM), chunk)
-        returns, lengths = rollout.evaluate(env, self.algorithm.policy(policy_params, deterministic=True), key)
-        return {"return": returns.mean(), "return_std": returns.std(), "length": lengths.mean()}
-
-    def _row(self, chunk: int, metrics: Metrics, scores: Metrics | None) -> Row:
-        row = name_metrics(jax.device_get(metrics), self.task.reward_terms)
+    def _row(self, chunk: int, metrics: Metrics) -> Row:
+        row = name_metrics(jax.device_get(metrics), self.task.reward_terms, self.algorithm.steps_per_update)
         row["speed/steps_per_second"] = self._speed(chunk)
-        if scores is not None:
-            row |= {f"eval/{name}": float(value) for name, value in scores.items()}
         return {"env_steps": chunk * self.steps_per_chunk, "wall_seconds": self._seconds(), **row}
 
     def _speed(self, chunk: int) -> float:
@@ -182,20 +173,21 @@ class Trainer:
     def _seconds(self) -> float:
         return self._seconds_before + time.monotonic() - self._started
 
-    def _keep_if_best(self, state: TrainState, scores: Metrics, chunk: int) -> None:
-        score = float(scores["return"])
-        if score > self._best_return:
-            self._best_return = score
-            facts = {"env_steps": chunk * self.steps_per_chunk, "eval_return": score}
-            save_best_policy(self.folder, self.algorithm.policy_params(state), facts)
-
     def _save(self, state: TrainState, chunk: int) -> None:
+        """Save the whole state; and the best policy, if it is a new one. Before the first evaluation is over, the
+        best policy is the present one."""
         env_steps = chunk * self.steps_per_chunk
-        facts = {"env_steps": env_steps, "wall_seconds": self._seconds(), "best_return": self._best_return}
+        facts = {"env_steps": env_steps, "wall_seconds": self._seconds()}
         checkpoint.save(checkpoint.step_path(self.folder.checkpoints, env_steps), state, facts)
         checkpoint.prune(self.folder.checkpoints, self.config.checkpoint.keep)
-        if not self.folder.best_policy.exists():
-            save_best_policy(self.folder, self.algorithm.policy_params(state), facts | {"eval_return": None})
+        live = state.env.live
+        if math.isinf(live.best_return):
+            save_best_policy(self.folder, self.algorithm.policy_params(state), {"env_steps": env_steps})
+        elif live.best_return > self._best_return:
+            self._best_return = float(live.best_return)
+            env_steps = int(live.best_update) * self.algorithm.steps_per_update
+            best_facts = {"env_steps": env_steps, "eval_return": self._best_return}
+            save_best_policy(self.folder, live.best_policy_params, best_facts)
 
 
 def _strong(tree: Any) -> Any:

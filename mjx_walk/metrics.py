@@ -20,16 +20,18 @@ _SECONDS_BETWEEN_LINES = 10.0
 """Where there is no terminal, progress is a plain line this often."""
 
 
-def name_metrics(metrics: Metrics, reward_terms: tuple[str, ...]) -> Row:
+def name_metrics(metrics: Metrics, reward_terms: tuple[str, ...], steps_per_update: int) -> Row:
     """Turn the metrics of one chunk into a log row.
 
     Args:
         metrics: `[updates] f32` each: the sums of `VectorEnv.step`, and the learner's means.
         reward_terms: which of them are reward terms.
+        steps_per_update: environment steps of an update.
 
     Returns:
         `episode/…`: means over the episodes that ended (absent if none did); `physics/…` and `resets/…`: counts;
-        `train/…`: the learner's.
+        `train/…`: the learner's; and if an evaluation has ended, `eval/…`, with the steps behind the policy that
+        was evaluated as `eval/env_steps`.
     """
     values = {name: np.asarray(value, np.float64) for name, value in metrics.items()}
     episodes = values.pop("episodes").sum()
@@ -43,6 +45,12 @@ def name_metrics(metrics: Metrics, reward_terms: tuple[str, ...]) -> Row:
     row["physics/overflow"] = counts["overflow"]
     row["resets/count"] = counts["resets"]
     row["resets/reuse_rate"] = counts["resets_reused"] / max(counts["resets"], 1.0)
+    scores = {name: values.pop(f"eval_{name}") for name in ("return", "return_std", "length", "update")}
+    ended = np.flatnonzero(~np.isnan(scores["return"]))
+    if ended.size:
+        last = {name: float(value[ended[-1]]) for name, value in scores.items()}
+        row["eval/env_steps"] = last.pop("update") * steps_per_update
+        row |= {f"eval/{name}": value for name, value in last.items()}
     return row | {f"train/{name}": float(value.mean()) for name, value in values.items()}
 
 

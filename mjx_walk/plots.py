@@ -40,7 +40,8 @@ def _learning_curve(rows: list[Row], path: Path) -> Path:
         for line, (quantity, title) in enumerate((("return", "return"), ("length", "episode length"))):
             plot = grid[line][column]
             for source, style in (("episode", {"alpha": 0.6}), ("eval", {"marker": "o", "markersize": 4})):
-                xs, ys = _series(rows, axis, f"{source}/{quantity}")
+                is_eval = source == "eval" and axis == "env_steps"
+                xs, ys = _series(rows, "eval/env_steps" if is_eval else axis, f"{source}/{quantity}")
                 if xs:
                     name = {"episode": "while training", "eval": "deterministic evaluation"}[source]
                     plot.plot([x / unit for x in xs], ys, label=name, **style)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mjx_walk.envs import Task
 from mjx_walk.types import Metrics, PolicyFn
 from mjx_walk.wrappers import Outcome, VectorEnv, VectorState
 
@@ -54,11 +55,12 @@ def unroll(
     return state, kept, jax.tree.map(lambda x: x.sum(0), stats)
 
 
-def evaluate(env: VectorEnv, policy: PolicyFn, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """One whole episode of each copy.
+def evaluate(task: Task, num_episodes: int, policy: PolicyFn, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Whole episodes, side by side.
 
     Args:
-        env: copies that are not staggered.
+        task: the unbatched environment.
+        num_episodes: B.
         policy: usually deterministic.
         key: starts and, if the policy draws, actions.
 
@@ -66,21 +68,17 @@ def evaluate(env: VectorEnv, policy: PolicyFn, key: jax.Array) -> tuple[jax.Arra
         Undiscounted returns `[B] f32` and lengths `[B] i32`.
     """
     reset_key, run_key = jax.random.split(key)
-    start = jax.vmap(env.task.reset)(jax.random.split(reset_key, env.num_envs))
+    start = jax.vmap(task.reset)(jax.random.split(reset_key, num_episodes))
 
     def one(carry, key):
         state, alive, returns, lengths = carry
-        state = jax.vmap(env.task.step)(state, policy(state.obs, key))
+        state = jax.vmap(task.step)(state, policy(state.obs, key))
         returns += jnp.where(alive, state.reward, 0.0)
         lengths += alive
         return (state, alive & ~state.terminated, returns, lengths), None
 
-    carry = (
-        start,
-        jnp.ones(env.num_envs, bool),
-        jnp.zeros(env.num_envs, jnp.float32),
-        jnp.zeros(env.num_envs, jnp.int32),
-    )
-    keys = jax.random.split(run_key, env.task.options.max_episode_steps)
+    none = jnp.zeros(num_episodes, jnp.float32)
+    carry = (start, jnp.ones(num_episodes, bool), none, none.astype(jnp.int32))
+    keys = jax.random.split(run_key, task.options.max_episode_steps)
     (_, _, returns, lengths), _ = jax.lax.scan(one, carry, keys)
     return returns, lengths

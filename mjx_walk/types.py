@@ -9,7 +9,9 @@ from brax.training.types import Transition
 __all__ = ["Algorithm", "Metrics", "PolicyFn", "TrainState", "Transition"]
 
 TrainState = Any
-"""One pytree with everything that influences the next update, and nothing else; each algorithm has its own."""
+"""One pytree with everything that a run needs to go on exactly; each algorithm has its own.
+
+All have the fields `env` (a `VectorState`), `key` and `updates`."""
 
 Metrics = dict[str, jax.Array]
 """`[] f32` each, by the names they are logged under."""

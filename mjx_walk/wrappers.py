@@ -1,12 +1,14 @@
 """Many copies of one environment: batching, automatic resets that keep the terminal observation, episode sums."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax
 import jax
 import jax.numpy as jnp
 
 from mjx_walk.envs import State, Task
+from mjx_walk.live_evaluation import LiveEvaluation, LiveEvaluator
+from mjx_walk.types import Metrics
 
 
 @flax.struct.dataclass
@@ -30,6 +32,8 @@ class VectorState:
     """`[R, …]` fresh random resets."""
     pool_used: jax.Array
     """`[] i32`: starts handed out since the pool was renewed."""
+    live: LiveEvaluation
+    """The evaluation that rides along."""
 
 
 class Outcome(NamedTuple):
@@ -43,44 +47,64 @@ class Outcome(NamedTuple):
 
 
 class VectorEnv:
-    """`num_envs` copies of a task, stepped together."""
+    """`num_envs` copies of a task that learn, and the evaluator's, all stepped together."""
 
-    def __init__(self, task: Task, num_envs: int, stagger: bool = False):
+    def __init__(self, task: Task, num_envs: int, evaluator: LiveEvaluator, stagger: bool = False):
         """
         Args:
             task: the unbatched environment.
             num_envs: copies, B.
+            evaluator: its copies, at most B, join the batch.
             stagger: start the copies at random times of their first episode, so that copies which never fall are
                 not cut off all at once. These first, shorter episodes are left out of the episode metrics.
         """
         self.task = task
         self.num_envs = num_envs
+        self.evaluator = evaluator
         self.stagger = stagger
 
-    def init(self, key: jax.Array) -> VectorState:
-        """All copies freshly reset, with a new pool."""
+    def init(self, key: jax.Array, policy_params: Any) -> VectorState:
+        """All copies freshly reset, with a new pool; the first evaluation is of `policy_params`."""
         env_key, pool_key, stagger_key = jax.random.split(key, 3)
         env = self._reset_many(env_key)
         if self.stagger:
             limit = self.task.options.max_episode_steps
             env = env.replace(steps=jax.random.randint(stagger_key, (self.num_envs,), 0, limit, jnp.int32))
         zeros = jnp.zeros(self.num_envs, jnp.float32)
+        pool = self._reset_many(pool_key)
         return VectorState(
             env=env,
             sums=EpisodeSums(zeros, {name: zeros for name in self.task.reward_terms}),
             is_whole=env.steps == 0,
-            pool=self._reset_many(pool_key),
+            pool=pool,
             pool_used=jnp.zeros((), jnp.int32),
+            live=self.evaluator.init(policy_params, pool),
         )
 
-    def renew_pool(self, state: VectorState, key: jax.Array) -> VectorState:
-        """Draw new random starts. A reset observation needs a forward pass, too dear for every copy at every step."""
-        return state.replace(pool=self._reset_many(key), pool_used=jnp.zeros((), jnp.int32))
+    def renew(
+        self, state: VectorState, key: jax.Array, policy_params: Any, update: jax.Array
+    ) -> tuple[VectorState, Metrics]:
+        """Once an update: draw new random starts, and begin the next evaluation where one has ended.
+
+        A reset observation needs a forward pass, too dear for every copy at every step; hence the pool.
+
+        Args:
+            state: all copies.
+            key: random key.
+            policy_params: the present policy.
+            update: `[] i32`, the number of updates behind it.
+
+        Returns:
+            The next state, and the scores of `LiveEvaluator.next_round`.
+        """
+        pool = self._reset_many(key)
+        live, scores = self.evaluator.next_round(state.live, policy_params, update, pool)
+        return state.replace(pool=pool, pool_used=jnp.zeros((), jnp.int32), live=live), scores
 
     def _reset_many(self, key: jax.Array) -> State:
         return jax.vmap(self.task.reset)(jax.random.split(key, self.num_envs))
 
-    def step(self, state: VectorState, action: jax.Array) -> tuple[VectorState, Outcome, dict[str, jax.Array]]:
+    def step(self, state: VectorState, action: jax.Array) -> tuple[VectorState, Outcome, Metrics]:
         """Step every copy and restart those whose episode has ended.
 
         Args:
@@ -92,7 +116,7 @@ class VectorEnv:
             `[] f32` each, that may be added up over steps: `episodes`, then over the episodes that ended `return`,
             `length` and each reward term; `nonfinite`, `overflow`, `resets` and `resets_reused`.
         """
-        env = jax.vmap(self.task.step)(state.env, action)
+        env, live = self._step_all(state, action)
         done = env.terminated | env.truncated
         sums = EpisodeSums(
             state.sums.reward + env.reward,
@@ -122,8 +146,18 @@ class VectorEnv:
             sums=jax.tree.map(lambda x: jnp.where(done, 0.0, x), sums),
             is_whole=state.is_whole | done,
             pool_used=pool_used,
+            live=live,
         )
         return next_state, Outcome(env.obs, env.reward, env.terminated, env.truncated), stats
+
+    def _step_all(self, state: VectorState, action: jax.Array) -> tuple[State, LiveEvaluation]:
+        """One physics call for the copies that learn and those that are evaluated."""
+        copies = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), state.env, state.live.env)
+        actions = jnp.concatenate([action, self.evaluator.act(state.live)])
+        copies = jax.vmap(self.task.step)(copies, actions)
+        env = jax.tree.map(lambda x: x[: self.num_envs], copies)
+        evaluated = jax.tree.map(lambda x: x[self.num_envs :], copies)
+        return env, self.evaluator.record(state.live, evaluated)
 
 
 def _where(condition: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:

@@ -12,7 +12,7 @@ ALGORITHMS: dict[str, tuple[Any, type]] = {"ppo": (make_ppo, PPOConfig)}
 __all__ = ["ALGORITHMS", "make_algorithm"]
 
 
-def make_algorithm(task: Task, num_envs: int, config: Any) -> Algorithm:
+def make_algorithm(task: Task, num_envs: int, num_eval_envs: int, config: Any) -> Algorithm:
     """Build the algorithm that the config's type belongs to."""
     assert dataclasses.is_dataclass(config)
-    return ALGORITHMS[config.name][0](task, num_envs, config)
+    return ALGORITHMS[config.name][0](task, num_envs, num_eval_envs, config)

@@ -17,6 +17,7 @@ from brax.training.networks import ACTIVATION
 from mjx_walk import networks, returns, rollout
 from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
+from mjx_walk.live_evaluation import LiveEvaluator
 from mjx_walk.schedules import anneal
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics, Transition
@@ -91,12 +92,13 @@ class PPOBatch:
     stats: Metrics
 
 
-def make_ppo(task: Task, num_envs: int, config: PPOConfig) -> Algorithm:
+def make_ppo(task: Task, num_envs: int, num_eval_envs: int, config: PPOConfig) -> Algorithm:
     """Build PPO for a task.
 
     Args:
         task: the unbatched environment.
-        num_envs: copies.
+        num_envs: copies that learn.
+        num_eval_envs: copies that are evaluated beside them.
         config: settings.
 
     Raises:
@@ -108,8 +110,16 @@ def make_ppo(task: Task, num_envs: int, config: PPOConfig) -> Algorithm:
             f"num_envs={num_envs} times algo.num_unrolls={config.num_unrolls} does not divide into "
             f"algo.num_minibatches={config.num_minibatches}; choose num_envs a multiple of {divisor}"
         )
-    env = VectorEnv(task, num_envs, stagger=config.stagger_episodes)
     nets = networks.make_ppo_networks(task, config)
+
+    def policy(policy_params, deterministic: bool = True):
+        act = brax_ppo_networks.make_inference_fn(nets)(policy_params, deterministic=deterministic)
+        return lambda obs, key: networks.to_env_action(task, act(obs, key)[0])
+
+    def policy_params(state: PPOState) -> Any:
+        return (state.normalizer, state.params.policy)
+
+    env = VectorEnv(task, num_envs, LiveEvaluator(task, num_eval_envs, policy), config.stagger_episodes)
     optimizer = _make_optimizer(config)
     steps_per_update = num_envs * config.unroll_length * config.num_unrolls
 
@@ -118,13 +128,14 @@ def make_ppo(task: Task, num_envs: int, config: PPOConfig) -> Algorithm:
         params = ppo_losses.PPONetworkParams(
             policy=nets.policy_network.init(policy_key), value=nets.value_network.init(value_key)
         )
+        normalizer = networks.init_normalizer(task.observation_size)
         return PPOState(
             params=params,
             optimizer=optimizer.init(params),
             learning_rate=jnp.float32(config.learning_rate),
-            normalizer=networks.init_normalizer(task.observation_size),
+            normalizer=normalizer,
             return_scale=returns.init_return_scale(num_envs),
-            env=env.init(env_key),
+            env=env.init(env_key, (normalizer, params.policy)),
             key=key,
             updates=jnp.zeros((), jnp.int32),
         )
@@ -167,7 +178,7 @@ def make_ppo(task: Task, num_envs: int, config: PPOConfig) -> Algorithm:
             env_state, kept, stats = rollout.unroll(env, env_state, actor, key, config.unroll_length, keep)
             return env_state, (*kept, env_state.env.obs, stats)
 
-        env_state = env.renew_pool(state.env, pool_key)
+        env_state, scores = env.renew(state.env, pool_key, policy_params(state), state.updates)
         keys = jax.random.split(run_key, config.num_unrolls)
         env_state, (transitions, reward, done, last_obs, stats) = jax.lax.scan(piece, env_state, keys)
         # Where an episode ended at a piece's last step, last_obs belongs to the next one: its discount is 0.
@@ -176,7 +187,7 @@ def make_ppo(task: Task, num_envs: int, config: PPOConfig) -> Algorithm:
         return_scale = returns.update_return_scale(
             state.return_scale, reward.reshape((-1, num_envs)), done.reshape((-1, num_envs)), config.discount
         )
-        batch = PPOBatch(transitions, reward_scale, jax.tree.map(lambda x: x.sum(0), stats))
+        batch = PPOBatch(transitions, reward_scale, jax.tree.map(lambda x: x.sum(0), stats) | scores)
         return state.replace(env=env_state, return_scale=return_scale, key=key), batch
 
     def learn(state: PPOState, batch: PPOBatch) -> tuple[PPOState, Metrics]:
@@ -231,13 +242,6 @@ def make_ppo(task: Task, num_envs: int, config: PPOConfig) -> Algorithm:
         )
         learning_rate = {"learning_rate": jnp.float32(rate * rate_factor), "reward_scale": batch.reward_scale}
         return new_state, batch.stats | _loss_metrics(metrics, config) | learning_rate
-
-    def policy(params, deterministic: bool = True):
-        act = brax_ppo_networks.make_inference_fn(nets)(params, deterministic=deterministic)
-        return lambda obs, key: networks.to_env_action(task, act(obs, key)[0])
-
-    def policy_params(state: PPOState) -> Any:
-        return (state.normalizer, state.params.policy)
 
     return Algorithm(init, collect, learn, policy_params, policy, steps_per_update)
 
