@@ -1,5 +1,8 @@
 """Gymnasium's Humanoid, HumanoidStandup and Walker2d as pure functions."""
 
+if __name__ != "mjx_walk.envs":  # a second copy of every class here would not match the first
+    raise ImportError("import mjx_walk.envs, not envs")
+
 import dataclasses
 import difflib
 from typing import Any

@@ -24,7 +24,8 @@ class WarpEngine:
     name = "warp"
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
-        wp.config.log_level = wp.LOG_WARNING
+        # Without a GPU, Warp would warn that it has found none.
+        wp.config.log_level = wp.LOG_ERROR if jax.default_backend() == "cpu" else wp.LOG_WARNING
         self._mj_model = with_newton_solver(model)
         # Warp would print two lines an overflow; it is returned instead, and counted in the metrics.
         self._model = mjx.put_model(self._mj_model, impl="warp", device=jax.local_devices()[0]).tree_replace(

@@ -1,0 +1,179 @@
+"""`python -m mjx_walk.bench env=humanoid`: what this machine does, beside Gymnasium on one of its cores."""
+
+import dataclasses
+import json
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+
+from mjx_walk import cli
+from mjx_walk.algos import make_algorithm
+from mjx_walk.api import make_task, resolve
+from mjx_walk.config import Config
+from mjx_walk.envs import TASKS, State, Task
+from mjx_walk.envs.physics import make_engine, resolve_engine
+from mjx_walk.evaluation import versions
+from mjx_walk.loop import make_chunk
+from mjx_walk.peers import brax_ppo_speed
+from mjx_walk.settings import setting
+
+USAGE = """
+usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [physics=auto] [num_envs=N] [seconds=5] [peers=false]
+                                [out=bench.json]
+
+  num_envs   copies; by default those of the recipe for this hardware
+  seconds    how long each speed is measured
+  peers      also Brax's PPO on Brax's own, reduced humanoid (two minutes on a GPU, an hour on a CPU)
+  out        the table as JSON, with versions
+"""
+
+
+@dataclasses.dataclass
+class Arguments:
+    env: str = setting("humanoid", choices=tuple(TASKS))
+    algo: str = setting("ppo", choices=("ppo",))
+    physics: str = "auto"
+    num_envs: int | None = setting(None, at_least=1)
+    seconds: float = setting(5.0, above=0)
+    peers: bool = False
+    out: str | None = None
+
+
+def main(arguments: list[str]) -> None:
+    """Measure, print a table, write JSON if asked."""
+    parsed = cli.parse(Arguments, arguments, USAGE)
+    overrides = [f"env={parsed.env}", f"algo={parsed.algo}", f"physics={parsed.physics}"]
+    if parsed.num_envs:
+        overrides.append(f"num_envs={parsed.num_envs}")
+    config = resolve(overrides)
+    jax.config.update("jax_default_matmul_precision", config.matmul_precision)
+    task = make_task(config)
+    device = f"{jax.devices()[0].device_kind}, physics={task.engine.name}, {config.num_envs} copies"
+    print(f"{task.gymnasium_id} on {device}", flush=True)
+    results: dict[str, float] = {}
+
+    def report(name: str, value: float, unit: str) -> None:
+        results[name] = value
+        print(f"  {name:<44} {value:>12,.1f} {unit}", flush=True)
+
+    gym_speed = gymnasium_speed(task, parsed.seconds)
+    report("Gymnasium, one core", gym_speed, "env-steps/s")
+    for name, measure in {
+        "physics only": physics_speed,
+        "physics, observation and reward": step_speed,
+    }.items():
+        report(name, measure(task, config.num_envs, parsed.seconds), "env-steps/s")
+    for name, value in training_figures(config, task, parsed.seconds).items():
+        report(name, value, "s" if name.startswith("compile") else "env-steps/s")
+    report("training / Gymnasium on one core", results["training"] / gym_speed, "times")
+    for name, value in peak_memory().items():
+        report(name, value, "GiB")
+    if parsed.peers:
+        num_envs = 2048 if config.hardware == "gpu" else 32
+        speed = brax_ppo_speed(num_envs, num_timesteps=20_000_000 if config.hardware == "gpu" else 20_000)
+        report(f"Brax's PPO on its reduced humanoid, {num_envs} copies", speed, "env-steps/s")
+    if parsed.out:
+        content = {"env": task.gymnasium_id, "device": device, "results": results, "versions": versions()}
+        Path(parsed.out).write_text(json.dumps(content, indent=1))
+
+
+def steps_per_second(advance: Callable[[Any], Any], carry: Any, steps_per_call: int, seconds: float) -> float:
+    """Time repeated calls of `carry → carry`, the first of which compiles and is not counted."""
+    carry = jax.block_until_ready(advance(carry))
+    start, calls = time.monotonic(), 0
+    while time.monotonic() - start < seconds:
+        carry = jax.block_until_ready(advance(carry))
+        calls += 1
+    return calls * steps_per_call / (time.monotonic() - start)
+
+
+def gymnasium_speed(task: Task, seconds: float) -> float:
+    """Steps per second of the real environment under random actions, resets included."""
+    env = gymnasium.make(task.gymnasium_id, **task.gymnasium_kwargs())
+    env.reset(seed=0)
+    start, steps = time.monotonic(), 0
+    while time.monotonic() - start < seconds:
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        steps += 1
+        if terminated or truncated:
+            env.reset()
+    return steps / (time.monotonic() - start)
+
+
+_STEPS_PER_CALL = 25
+"""About as long as a random policy keeps a humanoid up; every call starts from fresh resets, as Gymnasium's episodes do."""
+
+
+def _speed_under_random_actions(
+    task: Task, num_envs: int, seconds: float, begin: Callable[[State], Any], step: Callable[[Any, jax.Array], Any]
+) -> float:
+    start = jax.jit(jax.vmap(task.reset))(jax.random.split(jax.random.PRNGKey(0), num_envs))
+
+    @jax.jit
+    def advance(key):
+        def one(carry, _):
+            state, key = carry
+            key, action_key = jax.random.split(key)
+            low, high = task.action_low, task.action_high
+            action = jax.random.uniform(action_key, (num_envs, task.action_size), minval=low, maxval=high)
+            return (step(state, action), key), None
+
+        (state, key), _ = jax.lax.scan(one, (begin(start), key), length=_STEPS_PER_CALL)
+        # The key depends on the last state, so that nothing can be left out.
+        return key + jnp.isnan(jnp.concatenate([x.ravel() for x in jax.tree.leaves(state)])).any().astype(key.dtype)
+
+    return steps_per_second(advance, jax.random.PRNGKey(1), num_envs * _STEPS_PER_CALL, seconds)
+
+
+def physics_speed(task: Task, num_envs: int, seconds: float) -> float:
+    """Environment steps per second of the engine alone, no array derived."""
+    engine = make_engine(resolve_engine(task.engine.name), task.model, task.options.frame_skip, ())
+    step = jax.vmap(lambda state, action: engine.step(state, action)[0])
+    return _speed_under_random_actions(task, num_envs, seconds, lambda state: state.physics, step)
+
+
+def step_speed(task: Task, num_envs: int, seconds: float) -> float:
+    """The same with observation, reward and termination."""
+    return _speed_under_random_actions(task, num_envs, seconds, lambda state: state, jax.vmap(task.step))
+
+
+def training_figures(config: Config, task: Task, seconds: float) -> dict[str, float]:
+    """Training end to end as the loop runs it, and the compile time of its programs without and with a cache."""
+    algorithm = make_algorithm(task, config.num_envs, config.evaluation.num_envs, config.algo)
+    old_cache = jax.config.jax_compilation_cache_dir
+    figures = {}
+    with tempfile.TemporaryDirectory() as cache:
+        jax.config.update("jax_compilation_cache_dir", cache)
+        for name in ("compile and first update, cold cache", "compile and first update, warm cache"):
+            jax.clear_caches()
+            jax.experimental.compilation_cache.compilation_cache.reset_cache()
+            start = time.monotonic()
+            chunk = make_chunk(algorithm, 1, fused=task.engine.name != "c")
+            state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
+            state = jax.block_until_ready(chunk(state)[0])
+            figures[name] = time.monotonic() - start
+        jax.config.update("jax_compilation_cache_dir", old_cache)
+    speed = steps_per_second(lambda state: chunk(state)[0], state, algorithm.steps_per_update, seconds)
+    return figures | {"training": speed}
+
+
+def peak_memory() -> dict[str, float]:
+    """Highest memory use so far: of the process, and on a GPU of JAX's allocator there."""
+    unit = 1024 if sys.platform == "darwin" else 1
+    peaks = {"peak memory, host": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit / 2**20}
+    stats = jax.devices()[0].memory_stats()
+    if stats:
+        peaks["peak memory, device (JAX)"] = stats["peak_bytes_in_use"] / 2**30
+    return peaks
+
+
+if __name__ == "__main__":
+    cli.main(main)

@@ -1,0 +1,60 @@
+"""The MJX engines against MuJoCo's C library, one step at a time; the tolerances are `mjx_walk.parity`'s."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_walk import parity
+from mjx_walk.envs import TASKS, make_env
+from mjx_walk.envs.physics import mjx_warp
+
+CASES = [(name, "v5", physics) for name in TASKS for physics in ("jax", "warp")] + [("humanoid", "v4", "warp")]
+
+
+@pytest.mark.parametrize(("name", "version", "physics"), CASES)
+def test_one_step_from_standing_airborne_and_fallen_states(name, version, physics):
+    found = parity.check(name, version, physics, num_copies=24, num_steps=70)
+    assert found.is_within, "\n".join(map(str, found.errors))
+    assert found.num_steps >= 1600
+    if name != "humanoid_standup":  # both sides of the healthy range were visited
+        assert 100 < found.num_terminations < found.num_steps - 100
+
+
+def test_a_wrong_engine_is_noticed():
+    reference = make_env("walker2d", physics="c")
+    wrong = make_env("walker2d", physics="c", frame_skip=3)
+    states, actions = parity.reference_states(reference, 6, 5, seed=0)
+    assert not parity.compare(reference, wrong, states, actions).is_within
+
+
+@pytest.mark.parametrize("physics", ["jax", "warp"])
+def test_reset_observation(physics):
+    keys = jax.random.split(jax.random.PRNGKey(0), 4)
+    expected = jax.vmap(make_env("humanoid", physics="c").reset)(keys)
+    found = jax.vmap(make_env("humanoid", physics=physics).reset)(keys)
+    np.testing.assert_allclose(found.obs, expected.obs, rtol=2e-5, atol=2e-5)
+    np.testing.assert_array_equal(found.obs[:, :22], expected.physics.qpos[:, 2:])  # the raw quaternion
+    np.testing.assert_array_equal(found.obs[:, -78:], 0.0)  # no contact forces at reset
+
+
+@pytest.mark.parametrize(
+    "buffers",
+    [{"CONSTRAINTS_PER_COPY": 8}, {"CONTACTS_PER_COPY": 0, "SPARE_CONTACTS": 3}],
+    ids=["constraints", "contacts"],
+)
+def test_warp_overflow_is_reported(monkeypatch, buffers):
+    def overflows():
+        task = make_env("humanoid_standup", physics="warp")
+        states = jax.vmap(task.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
+
+        def one(state, _):
+            state = jax.vmap(task.step)(state, jnp.zeros((2, 17)))
+            return state, state.metrics["overflow"].sum()
+
+        return jax.jit(lambda state: jax.lax.scan(one, state, length=20)[1].max())(states)
+
+    assert overflows() == 0
+    for name, size in buffers.items():
+        monkeypatch.setattr(mjx_warp, name, size)
+    assert overflows() == 2

@@ -1,0 +1,160 @@
+"""PPO: its update equals Brax's, it learns on every engine, and it compiles once."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs.base import Env, State
+from brax.training import acting
+from brax.training.agents.ppo import networks as brax_networks
+from brax.training.agents.ppo import train as brax_ppo
+
+from mjx_walk.algos.ppo import PPOConfig, make_ppo
+from mjx_walk.envs import make_env
+from mjx_walk.peers import restore_device_put_replicated
+
+SMALL = PPOConfig(
+    unroll_length=8,
+    num_unrolls=1,
+    num_minibatches=4,
+    num_epochs=3,
+    policy_hidden_layer_sizes=(32, 32),
+    value_hidden_layer_sizes=(32, 32),
+)
+
+
+class _Sizes(Env):
+    """Tells Brax's trainer the sizes; its transitions come from our own environment."""
+
+    observation_size, action_size, backend = 17, 6, "mjx"
+
+    def reset(self, rng):
+        return State(None, jnp.zeros(17), jnp.zeros(()), jnp.zeros(()))
+
+    def step(self, state, action):
+        return state
+
+
+def test_update_equals_brax(monkeypatch):
+    """Brax's own trainer, given our initial networks and our transitions, ends at our parameters.
+
+    The shuffle is fixed and the entropy bonus off, since the two draw their keys in another order. The batch has no
+    truncation, which Brax masks and we bootstrap.
+    """
+    config = dataclasses.replace(SMALL, entropy_cost=0.0, observation_clip=None, stagger_episodes=False)
+    task = make_env("walker2d", physics="c")
+    algorithm = make_ppo(task, 32, 1, config)
+    state, batch = jax.jit(algorithm.collect)(jax.jit(algorithm.init)(jax.random.PRNGKey(0)))
+    assert batch.transitions.discount.min() >= 0 and batch.stats["episodes"] >= 0
+
+    def fixed_order(key, x, *args, **kwargs):
+        return jnp.arange(x) if isinstance(x, int) else x
+
+    monkeypatch.setattr(jax.random, "permutation", fixed_order)
+    ours, metrics = jax.jit(algorithm.learn)(state, batch)
+
+    data = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batch.transitions)  # [T, B, …]
+    last = jnp.broadcast_to(data.next_observation, data.observation.shape)
+    zeros = jnp.zeros_like(data.reward)
+    extras = data.extras | {"state_extras": {"truncation": zeros, "episode_metrics": {}, "episode_done": zeros}}
+    data = data._replace(next_observation=last, extras=extras)
+    monkeypatch.setattr(acting, "generate_unroll", lambda env, state, *args, **kwargs: (state, data))
+    restore_device_put_replicated()
+    _, theirs, _ = brax_ppo.train(
+        environment=_Sizes(),
+        num_timesteps=32 * 8,
+        num_evals=1,
+        run_evals=False,
+        num_envs=32,
+        episode_length=1000,
+        unroll_length=config.unroll_length,
+        batch_size=32 // config.num_minibatches,
+        num_minibatches=config.num_minibatches,
+        num_updates_per_batch=config.num_epochs,
+        learning_rate=config.learning_rate,
+        max_grad_norm=config.max_policy_grad_norm,
+        entropy_cost=0.0,
+        discounting=config.discount,
+        reward_scaling=config.reward_scale,
+        gae_lambda=config.gae_lambda,
+        clipping_epsilon=config.clip_epsilon,
+        normalize_observations=True,
+        network_factory=lambda *args, **kwargs: brax_networks.make_ppo_networks(
+            *args, policy_hidden_layer_sizes=(32, 32), value_hidden_layer_sizes=(32, 32), **kwargs
+        ),
+        restore_params=(state.normalizer, state.params.policy, state.params.value),
+    )
+    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), ours.params, state.params)
+    assert max(jax.tree.leaves(moved)) > 1e-3
+    expected = (theirs[0].mean, theirs[0].std, theirs[1], theirs[2])
+    found = (ours.normalizer.mean, ours.normalizer.std, ours.params.policy, ours.params.value)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6), found, expected)
+    assert all(np.isfinite(value) for name, value in metrics.items() if not name.startswith("eval"))
+
+
+@pytest.mark.parametrize("physics", ["jax", "warp", "c"])
+def test_small_batch_training_learns(physics):
+    """Sixteen copies of a walker that is paid for standing learn to stand longer, on every engine."""
+    task = make_env("walker2d", physics=physics, forward_reward_weight=0.0)
+    config = dataclasses.replace(SMALL, unroll_length=32, num_epochs=8, learning_rate=3e-3, discount=0.95)
+    algorithm = make_ppo(task, 16, 2, config)
+    state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
+    collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
+    lengths = []
+    for _ in range(24):
+        state, metrics = learn(*collect(state))
+        lengths.append((float(metrics["length"]), float(metrics["episodes"])))
+        assert metrics["nonfinite"] == 0 and metrics["overflow"] == 0
+    early, late = np.sum(lengths[:4], axis=0), np.sum(lengths[-8:], axis=0)
+    assert late[0] / late[1] > 2.5 * early[0] / early[1]
+
+
+@pytest.mark.parametrize("changes", [
+    {"distribution": "normal"},
+    {"learning_rate_schedule": "adaptive_kl", "normalize_rewards": True},
+    {"max_value_grad_norm": 0.5, "entropy_schedule": "linear", "learning_rate_schedule": "linear"},
+])
+def test_options_train(changes):
+    task = make_env("walker2d", physics="c")
+    algorithm = make_ppo(task, 8, 1, dataclasses.replace(SMALL, num_minibatches=2, **changes))
+    state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
+    collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
+    for _ in range(2):
+        before = state.params
+        state, metrics = learn(*collect(state))
+        assert np.isfinite(metrics["loss"]) and metrics["learning_rate"] > 0
+    change = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), before, state.params)
+    assert min(jax.tree.leaves(change)) > 0
+    action = algorithm.policy(algorithm.policy_params(state), deterministic=False)(
+        state.env.env.obs, jax.random.PRNGKey(0)
+    )
+    assert (jnp.abs(action) <= 1).all()
+
+
+def test_linear_schedule_has_its_own_horizon():
+    task = make_env("walker2d", physics="c")
+    horizon = 8 * 8 * 4  # four updates
+    config = dataclasses.replace(SMALL, num_minibatches=2, learning_rate_schedule="linear", schedule_steps=horizon)
+    algorithm = make_ppo(task, 8, 1, config)
+    state, rates = jax.jit(algorithm.init)(jax.random.PRNGKey(0)), []
+    collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
+    for _ in range(5):
+        state, metrics = learn(*collect(state))
+        rates.append(float(metrics["learning_rate"]) / config.learning_rate)
+    np.testing.assert_allclose(rates, [1.0, 0.75, 0.5, 0.25, 0.0], atol=1e-6)
+
+
+def test_learning_uses_the_terminal_value_only_where_truncated():
+    """A batch in which every episode is cut off pays the lost value; one that terminates does not."""
+    task = make_env("humanoid_standup", physics="c", max_episode_steps=4)
+    config = dataclasses.replace(SMALL, num_minibatches=2, stagger_episodes=False, reward_scale=0.01)
+    algorithm = make_ppo(task, 4, 1, config)
+    state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
+    _, batch = jax.jit(algorithm.collect)(state)
+    ended = batch.transitions.discount == 0
+    np.testing.assert_array_equal(ended, np.tile([False, False, False, True] * 2, (4, 1)))
+    plain = jnp.where(ended, jnp.nan, batch.transitions.reward)
+    jump = batch.transitions.reward[:, 3] - plain[:, 2]
+    assert (jnp.abs(jump) > 0.5).all()  # γ·V(s') / 0.01 on top of a reward that hardly changes in a step

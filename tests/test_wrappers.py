@@ -1,0 +1,113 @@
+"""Automatic resets, episode sums, the pool of starts, and the evaluation that rides along."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_walk.envs import make_env
+from mjx_walk.live_evaluation import LiveEvaluator
+from mjx_walk.wrappers import VectorEnv
+
+
+def still(task):
+    """A policy that does nothing."""
+    return lambda params: lambda obs, key: jnp.zeros((obs.shape[0], task.action_size))
+
+
+def make_vector(task, num_envs, num_eval_envs=2, **kwargs):
+    return VectorEnv(task, num_envs, LiveEvaluator(task, num_eval_envs, still(task)), **kwargs)
+
+
+@pytest.fixture(scope="module")
+def walker():
+    return make_env("walker2d", physics="c", max_episode_steps=30)
+
+
+def test_terminal_observation_is_kept_and_sums_match_a_loop(walker):
+    env = make_vector(walker, 3)
+    state = env.init(jax.random.PRNGKey(0), ())
+    alone = jax.tree.map(lambda x: x[0], state.env)
+    action = jnp.ones((3, 6))
+    total, length, sums = 0.0, 0, {}
+    step = jax.jit(env.step)
+    for _ in range(30):
+        alone = walker.step(alone, action[0])
+        total += float(alone.reward)
+        length += 1
+        state, outcome, stats = step(state, action)
+        np.testing.assert_allclose(outcome.obs[0], alone.obs, rtol=1e-6)  # also at the end: not the reset's
+        for name, value in stats.items():
+            sums[name] = sums.get(name, 0.0) + float(value)
+        if alone.terminated or alone.truncated:
+            break
+    assert bool(outcome.terminated[0] | outcome.truncated[0])
+    assert state.env.steps[0] == 0 and state.sums.reward[0] == 0
+    assert np.abs(state.env.obs[0] - alone.obs).max() > 0.1
+    in_pool = (state.pool.obs == state.env.obs[0]).all(axis=1)
+    assert in_pool.any()
+    one = make_vector(walker, 1)
+    state, stats_sum = one.init(jax.random.PRNGKey(0), ()), {}
+    state = state.replace(env=jax.tree.map(lambda x: x[:1], env.init(jax.random.PRNGKey(0), ()).env))
+    for _ in range(length):
+        state, _, stats = jax.jit(one.step)(state, action[:1])
+        stats_sum = {name: stats_sum.get(name, 0.0) + float(value) for name, value in stats.items()}
+    assert stats_sum["episodes"] == 1 and stats_sum["length"] == length and stats_sum["resets"] == 1
+    assert stats_sum["return"] == pytest.approx(total, rel=1e-5)
+    terms = sum(stats_sum[name] for name in walker.reward_terms)
+    assert terms == pytest.approx(total, rel=1e-5)
+
+
+def test_truncated_copies_restart_from_different_starts_and_reuse_is_counted(walker):
+    env = make_vector(walker, 4)
+    state = env.init(jax.random.PRNGKey(0), ())
+    step = jax.jit(env.step)
+    at_end = walker.options.max_episode_steps - 1
+    reused = 0.0
+    for round_ in range(2):
+        state = state.replace(env=state.env.replace(steps=jnp.full(4, at_end)))
+        state, outcome, stats = step(state, jnp.zeros((4, 6)))
+        assert stats["resets"] == 4
+        assert len(np.unique(np.asarray(state.env.obs), axis=0)) == 4
+        reused += float(stats["resets_reused"])
+        assert reused == 4 * round_  # the pool holds four: the second round draws them again
+    state, _ = env.renew(state, jax.random.PRNGKey(5), (), jnp.int32(0))
+    state = state.replace(env=state.env.replace(steps=jnp.full(4, at_end)))
+    assert step(state, jnp.zeros((4, 6)))[2]["resets_reused"] == 0
+
+
+def test_staggered_first_episodes_are_not_counted(walker):
+    env = make_vector(walker, 32, stagger=True)
+    state = env.init(jax.random.PRNGKey(0), ())
+    assert len(np.unique(state.env.steps)) > 10
+    state = state.replace(env=state.env.replace(steps=jnp.full(32, 29)), is_whole=jnp.arange(32) < 3)
+    state, _, stats = jax.jit(env.step)(state, jnp.zeros((32, 6)))
+    assert stats["resets"] == 32 and stats["episodes"] == 3
+    assert bool(state.is_whole.all())
+
+
+def test_live_evaluation_equals_an_evaluation_on_its_own(walker):
+    """Deterministic episodes in the training batch return what the same episodes return alone."""
+    env = make_vector(walker, 3, num_eval_envs=2)
+    state = env.init(jax.random.PRNGKey(0), ())
+    starts = state.live.env
+    step = jax.jit(env.step)
+    for _ in range(30):
+        state, _, _ = step(state, jnp.ones((3, 6)))
+    expected = []
+    for i in range(2):
+        alone, total = jax.tree.map(lambda x, i=i: x[i], starts), 0.0
+        for _ in range(30):
+            alone = walker.step(alone, jnp.zeros(6))
+            total += float(alone.reward)
+            if alone.terminated:
+                break
+        expected.append(total)
+    assert not state.live.alive.any()
+    np.testing.assert_allclose(state.live.returns, expected, rtol=1e-5)
+    state, scores = env.renew(state, jax.random.PRNGKey(1), (), jnp.int32(7))
+    assert scores["eval_return"] == pytest.approx(np.mean(expected), rel=1e-5) and scores["eval_update"] == 0
+    assert state.live.best_return == scores["eval_return"] and state.live.snapshot_update == 7
+    assert state.live.alive.all()
+    _, unfinished = env.renew(state, jax.random.PRNGKey(2), (), jnp.int32(8))
+    assert np.isnan(unfinished["eval_return"])
