@@ -4,13 +4,14 @@ import dataclasses
 import importlib.metadata
 import json
 import os
+import pickle
 import platform
+import subprocess
+import sys
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import jax
 import numpy as np
 
@@ -78,7 +79,7 @@ def score_in_gymnasium(
 ) -> Scores:
     """Whole episodes in `gymnasium.make`: CPU MuJoCo, float64, the model's own solver.
 
-    The episodes run side by side, one environment each, stepped by one thread a core.
+    The episodes run side by side, shared out over one process a core.
 
     Args:
         task: says which environment, with which keywords.
@@ -86,32 +87,60 @@ def score_in_gymnasium(
         num_episodes: N.
         seed: episode i is reset with `seed + i`.
     """
-    kwargs = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
-    envs = [gymnasium.make(task.gymnasium_id, **kwargs) for _ in range(num_episodes)]
+    keywords = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
     seeds = [seed + i for i in range(num_episodes)]
     returns, lengths = np.zeros(num_episodes), np.zeros(num_episodes, np.int64)
-    obs = np.stack([env.reset(seed=s)[0] for env, s in zip(envs, seeds, strict=True)]).astype(np.float32)
-    running = np.arange(num_episodes)
-
-    def step(i: int, action: np.ndarray) -> bool:
-        obs[i], reward, terminated, truncated, _ = envs[i].step(action)
-        returns[i] += reward
-        lengths[i] += 1
-        return terminated or truncated
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        num_shares = os.cpu_count() or 1
-        while running.size:
-            actions = np.asarray(act(obs))
-
-            def step_share(share: np.ndarray, actions: np.ndarray = actions) -> list[bool]:
-                return [step(i, actions[i]) for i in share]
-
-            ended = np.concatenate(list(pool.map(step_share, np.array_split(running, num_shares)))).astype(bool)
-            running = running[~ended]
-    for env in envs:
-        env.close()
+    is_over = np.zeros(num_episodes, bool)
+    shares = [share for share in np.array_split(np.arange(num_episodes), os.cpu_count() or 1) if share.size]
+    workers = [_Worker() for _ in shares]
+    try:
+        for worker, share in zip(workers, shares, strict=True):
+            worker.send((task.gymnasium_id, keywords, [seeds[i] for i in share]))
+        obs = np.concatenate([worker.receive() for worker in workers])
+        while not is_over.all():
+            actions = np.asarray(act(obs.astype(np.float32)))
+            lengths += ~is_over
+            for worker, share in zip(workers, shares, strict=True):
+                worker.send(actions[share])
+            for worker, share in zip(workers, shares, strict=True):
+                obs[share], rewards, is_over[share] = worker.receive()
+                returns[share] += rewards
+    finally:
+        for worker in workers:
+            worker.close()
     return Scores(returns, lengths, seeds, task.gymnasium_id)
+
+
+class _Worker:
+    """A `gymnasium_worker` process. Not `multiprocessing`, which would import the user's main module again."""
+
+    def __init__(self) -> None:
+        paths = os.pathsep.join([str(Path(mjx_walk.__file__).parent.parent), os.environ.get("PYTHONPATH", "")])
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "mjx_walk.gymnasium_worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | {"PYTHONPATH": paths},
+            start_new_session=True,  # Ctrl-C is for the parent
+        )
+
+    def send(self, message: Any) -> None:
+        assert self._process.stdin
+        pickle.dump(message, self._process.stdin, protocol=pickle.HIGHEST_PROTOCOL)
+        self._process.stdin.flush()
+
+    def receive(self) -> Any:
+        assert self._process.stdout
+        try:
+            return pickle.load(self._process.stdout)
+        except EOFError:
+            raise RuntimeError("a Gymnasium process ended; its error is above") from None
+
+    def close(self) -> None:
+        assert self._process.stdin and self._process.stdout
+        self._process.stdin.close()
+        self._process.stdout.close()
+        self._process.wait()
 
 
 def score_in_sim(task: Task, policy: PolicyFn, num_episodes: int, seed: int = 0) -> Scores:

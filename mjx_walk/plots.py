@@ -48,7 +48,8 @@ def _learning_curve(rows: list[Row], path: Path) -> Path:
             plot.set_ylabel(title)
             plot.grid(alpha=0.3)
         grid[1][column].set_xlabel(label)
-    grid[0][0].legend()
+    if grid[0][0].get_legend_handles_labels()[0]:
+        grid[0][0].legend()
     figure.savefig(path, dpi=110)
     return path
 

@@ -5,11 +5,12 @@ import sys
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, open_dict
 
 from mjx_walk import cli
 from mjx_walk.api import resolve, train
-from mjx_walk.config import CONFIG_DIR, complete_overrides, register_schemas, to_config
+from mjx_walk.config import CONFIG_DIR, complete_overrides, load_config, register_schemas, to_config
 from mjx_walk.interrupt import exit_code
 
 USAGE = """
@@ -38,9 +39,10 @@ def main(arguments: list[str]) -> int:
 
 def _through_hydra(arguments: list[str]) -> None:
     """Hand flags to Hydra: sweeps, launchers, `--cfg`."""
-    flags = [argument for argument in arguments if argument.startswith("-")]
-    overrides = [argument for argument in arguments if not argument.startswith("-")]
-    sys.argv = [sys.argv[0], *flags, *complete_overrides(overrides)]
+    overrides = [a for a in arguments if not a.startswith("-") and ("=" in a or a[0] in "+~")]
+    parsed = OverridesParser.create().parse_overrides(complete_overrides(overrides))
+    load_config([str(o.input_line) for o in parsed if not o.is_sweep_override() and not o.key_or_group.startswith("hydra")])
+    sys.argv = [sys.argv[0], *arguments, str(parsed[0].input_line)]
     os.environ["HYDRA_FULL_ERROR"] = "1"
     register_schemas()
     hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")(_sweep_job)()

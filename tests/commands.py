@@ -1,0 +1,33 @@
+"""Run the commands as a user does, small."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+TINY = (
+    "env=walker2d",
+    "num_envs=8",
+    "evaluation.num_envs=2",
+    "evaluation.gymnasium_episodes=0",
+    "algo.unroll_length=8",
+    "algo.num_minibatches=2",
+    "algo.num_epochs=2",
+    "checkpoint.every_chunks=2",
+)
+TINY_CHUNK = 8 * 8
+"""Environment steps of a chunk of it."""
+
+
+def command(module: str, *arguments: str, **kwargs) -> subprocess.CompletedProcess:
+    """`python -m mjx_walk.MODULE ARGUMENTS`, in a process of its own."""
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent), **kwargs.pop("env", {})}
+    return subprocess.run(
+        [sys.executable, "-m", f"mjx_walk.{module}", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        env=environment,
+        check=False,
+        **kwargs,
+    )

@@ -1,0 +1,151 @@
+"""Each mistake gets one clear line that names the valid choices, exit code 2, and costs nothing."""
+
+import subprocess
+import sys
+
+import pytest
+import yaml
+from commands import TINY, TINY_CHUNK, command
+
+from mjx_walk import api, run_folder
+from mjx_walk import eval as eval_command
+from mjx_walk import train as train_command
+from mjx_walk.errors import UserError
+
+CASES = [
+    (["env=ant"], "unknown env 'ant'; choose one of: humanoid, humanoid_standup, walker2d"),
+    (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo"),
+    (["physics=bullet"], "physics=bullet: choose one of: auto, warp, jax, c"),
+    (["env.version=v3"], "env.version=v3: choose one of: v5, v4"),
+    (["recipe=nope"], "recipes: cpu/humanoid_ppo"),
+    (["num_env=4"], "unknown key 'num_env'; did you mean: num_envs"),
+    (["algo.discont=0.9"], "unknown key 'algo.discont'; did you mean: algo.discount"),
+    (["+extra=1"], "'+extra=1': keys cannot be added or removed"),
+    (["++extra=1"], "keys cannot be added or removed"),
+    (["~seed"], "keys cannot be added or removed"),
+    (["humanoid"], "cannot read the command line"),
+    (["num_envs=many"], "num_envs: Value 'many' of type 'str' could not be converted to Integer"),
+    (["num_envs=0"], "num_envs=0: must be at least 1"),
+    (["total_steps=-5"], "total_steps=-5: must be at least 1"),
+    (["algo.learning_rate=nan"], "algo.learning_rate=nan: must be a number"),
+    (["algo.learning_rate=0"], "algo.learning_rate=0.0: must be above 0"),
+    (["algo.learning_rate=inf"], "must be finite"),
+    (["algo.discount=1.5"], "must be at most 1"),
+    (["algo.activation=sinus"], "algo.activation=sinus: choose one of: celu"),
+    (["env.frame_skip=0"], "env.frame_skip=0: must be at least 1"),
+    (["env.reset_noise_scale=-1"], "must be at least 0"),
+    (["env.xml_file=nowhere.xml"], "model file not found"),
+    (["num_envs=7"], "choose num_envs a multiple of 8"),
+    (["resume=true"], "resume=true needs run_dir"),
+    (["resume=true", "run_dir=/nowhere/at/all"], "no run at '/nowhere/at/all'"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "says"), CASES, ids=[" ".join(case[0]) for case in CASES])
+def test_train_names_the_mistake(arguments, says, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError) as error:
+        train_command.main(arguments)
+    assert says in str(error.value) and "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+EVAL_CASES = [
+    ([], "say which run"),
+    (["run=/nowhere"], "no run at '/nowhere'"),
+    (["run=x", "episodes=0"], "episodes=0: must be at least 1"),
+    (["run=x", "episodes=ten"], "episodes=ten"),
+    (["run=x", "backend=brax"], "choose one of: gymnasium, sim"),
+    (["run=x", "epsodes=3"], "unknown key 'epsodes'; valid: run, episodes, backend, seed, physics"),
+    (["x"], "cannot read 'x', write key=value"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "says"), EVAL_CASES)
+def test_eval_names_the_mistake(arguments, says):
+    with pytest.raises(UserError) as error:
+        eval_command.main(arguments)
+    assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_command_prints_one_line_and_exits_with_2(tmp_path):
+    for module, argument in (("train", "env=ant"), ("eval", "run=nowhere"), ("bench", "env=ant"), ("parity", "x=1")):
+        done = command(module, argument, cwd=tmp_path)
+        assert done.returncode == 2
+        lines = [line for line in done.stderr.splitlines() if line]
+        assert len(lines) == 1 and lines[0].startswith("error: "), done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_warp_missing(monkeypatch):
+    from mjx_walk.envs import physics
+
+    monkeypatch.setattr(physics.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"physics=warp needs Warp: install it with pip install 'mjx-walk\[warp\]'"):
+        physics.resolve_engine("warp")
+    assert physics.resolve_engine("auto") == "c"
+
+
+def test_a_folder_that_is_not_ours_is_left_alone(tmp_path):
+    theirs = tmp_path / "thesis"
+    theirs.mkdir()
+    (theirs / "chapter.tex").write_text("years of work")
+    file = tmp_path / "file"
+    file.write_text("x")
+    for path, says in ((theirs, "exists and is not a run folder"), (file, "is a file"), ("/proc/no", "cannot write")):
+        with pytest.raises(UserError, match=says):
+            train_command.main([*TINY, f"run_dir={path}"])
+    assert [p.name for p in theirs.iterdir()] == ["chapter.tex"]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A tiny run."""
+    path = tmp_path_factory.mktemp("runs") / "run"
+    train_command.main([*TINY, f"run_dir={path}", f"total_steps={2 * TINY_CHUNK}"])
+    return path
+
+
+def test_a_finished_run_is_not_overwritten(finished):
+    before = (finished / "metrics.jsonl").read_text()
+    with pytest.raises(UserError, match="holds a run already; add resume=true"):
+        train_command.main([*TINY, f"run_dir={finished}"])
+    assert (finished / "metrics.jsonl").read_text() == before
+
+
+def test_resume_names_the_keys_that_differ(finished):
+    same = [*TINY, f"run_dir={finished}", "resume=true", f"total_steps={2 * TINY_CHUNK}"]
+    with pytest.raises(UserError) as error:
+        train_command.main([*same, "algo.discount=0.5", "seed=9"])
+    assert "algo.discount (was 0.99, now 0.5)" in str(error.value) and "seed (was 0, now 9)" in str(error.value)
+    with pytest.raises(UserError, match="may only grow"):
+        train_command.main([*same[:-1], f"total_steps={TINY_CHUNK}"])
+    with pytest.raises(UserError, match=r"env\.name \(was walker2d, now humanoid\)"):
+        train_command.main([*same, "env=humanoid"])
+
+
+def test_a_policy_of_another_environment_is_refused(finished, tmp_path):
+    import shutil
+
+    copy = tmp_path / "copy"
+    shutil.copytree(finished, copy)
+    config = yaml.safe_load((copy / "config.yaml").read_text())
+    config["env"]["exclude_current_positions_from_observation"] = False
+    (copy / "config.yaml").write_text(yaml.safe_dump(config))
+    with pytest.raises(UserError, match=r"is of another run: .* should be \(18"):
+        api.load_run(copy)
+    (copy / "config.yaml").write_text("not: ours\n")
+    with pytest.raises(UserError, match="not a configuration of this version"):
+        api.load_run(copy)
+    shutil.rmtree(copy / "checkpoints")
+    shutil.copy(finished / "config.yaml", copy / "config.yaml")
+    with pytest.raises(UserError, match="holds no policy yet"):
+        api.load_run(copy)
+    assert run_folder.open_existing(finished).path == finished
+
+
+def test_a_bare_envs_is_refused(tmp_path):
+    code = "import sys; sys.path.insert(0, sys.argv[1]); import envs"
+    clone = str(run_folder.Path(__file__).parent.parent)
+    done = subprocess.run([sys.executable, "-c", code, clone], capture_output=True, text=True, check=False)
+    assert "import mjx_walk.envs, not envs" in done.stderr

@@ -1,0 +1,79 @@
+"""Training stopped and resumed in a new process equals training that never stopped, bit for bit."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+from commands import TINY, TINY_CHUNK, command
+from test_checkpoint import flip_a_byte
+
+from mjx_walk import checkpoint
+from mjx_walk.api import resolve
+
+
+def leaves(run_dir, chunk):
+    with ocp.PyTreeCheckpointer() as checkpointer:
+        return checkpointer.restore(checkpoint.step_path(run_dir / "checkpoints", chunk * TINY_CHUNK) / "arrays")
+
+
+def train(run_dir, *arguments):
+    done = command("train", *TINY, f"run_dir={run_dir}", *arguments)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.mark.parametrize("physics", ["c", "jax", "warp"])
+def test_n_and_n_chunks_equal_2n(tmp_path, physics):
+    engine = f"physics={physics}"
+    train(tmp_path / "whole", engine, f"total_steps={6 * TINY_CHUNK}")
+    train(tmp_path / "halves", engine, f"total_steps={3 * TINY_CHUNK}")
+    resumed = command("train", f"run_dir={tmp_path}/halves", "resume=true", f"total_steps={6 * TINY_CHUNK}")
+    assert resumed.returncode == 0, resumed.stderr
+    whole, halves = leaves(tmp_path / "whole", 6), leaves(tmp_path / "halves", 6)
+    assert whole.keys() == halves.keys() and len(whole) > 50
+    for name, leaf in whole.items():
+        np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
+    assert not np.array_equal(whole["params.policy.params.hidden_0.kernel"],
+                              leaves(tmp_path / "halves", 3)["params.policy.params.hidden_0.kernel"])
+    rows = [json.loads(line) for line in (tmp_path / "halves" / "metrics.jsonl").read_text().splitlines()]
+    assert [row["env_steps"] for row in rows] == [i * TINY_CHUNK for i in range(1, 7)]
+    seconds = [row["wall_seconds"] for row in rows]
+    assert seconds == sorted(seconds)
+
+
+def test_a_damaged_checkpoint_costs_only_its_own_chunks(tmp_path):
+    train(tmp_path / "whole", f"total_steps={6 * TINY_CHUNK}")
+    train(tmp_path / "run", f"total_steps={4 * TINY_CHUNK}")
+    flip_a_byte(checkpoint.step_path(tmp_path / "run" / "checkpoints", 4 * TINY_CHUNK))
+    resumed = train(tmp_path / "run", f"total_steps={6 * TINY_CHUNK}", "resume=true")
+    assert "damaged" in resumed.stderr and "falling back" in resumed.stderr
+    whole, run = leaves(tmp_path / "whole", 6), leaves(tmp_path / "run", 6)
+    for name, leaf in whole.items():
+        np.testing.assert_array_equal(leaf, run[name], err_msg=name)
+    rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert [row["env_steps"] for row in rows] == [i * TINY_CHUNK for i in range(1, 7)]
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGUSR1"])
+def test_signals_finish_the_chunk_save_and_say_how_to_go_on(tmp_path, name):
+    run_dir = tmp_path / "run"
+    arguments = [sys.executable, "-m", "mjx_walk.train", *TINY, f"run_dir={run_dir}", "total_steps=100000000"]
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
+    deadline = time.monotonic() + 120
+    while not (run_dir / "metrics.jsonl").exists() or not (run_dir / "metrics.jsonl").read_text():
+        assert time.monotonic() < deadline and process.poll() is None, process.communicate()
+        time.sleep(0.2)
+    process.send_signal(getattr(signal, name))
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 128 + getattr(signal, name).value
+    assert f"To go on: python -m mjx_walk.train run_dir={run_dir} resume=true" in out and "Traceback" not in err
+    last = json.loads((run_dir / "metrics.jsonl").read_text().splitlines()[-1])["env_steps"]
+    newest = checkpoint.list_steps(run_dir / "checkpoints")[-1]
+    assert int(newest.name) == last
+    assert resolve([f"run_dir={run_dir}", "resume=true"]).env.name == "walker2d"
