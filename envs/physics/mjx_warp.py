@@ -10,12 +10,16 @@ from mujoco import mjx
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
 
-CONTACTS_PER_COPY = 24
-"""Contacts a copy may hold on average over the batch; the batch shares one buffer."""
+CONTACTS_PER_COPY = 16
+"""Contacts a copy may hold on average over the batch, which shares one buffer.
+
+Measured: at most 8.8 (HumanoidStandup, 2,048 copies on the floor under random actions), 7.3 under trained policies."""
 SPARE_CONTACTS = 256
 """Room on top, so that a small batch, whose average swings further, does not overflow."""
-CONSTRAINTS_PER_COPY = 112
-"""Constraint rows of any one copy: four for a contact with friction, one for any other and for a joint limit."""
+CONSTRAINTS_PER_COPY = 80
+"""Constraint rows of any one copy: four for a contact with friction, one for any other and for a joint limit.
+
+Measured: at most 49 under random actions, 31 under trained policies."""
 
 
 class WarpEngine:
