@@ -5,8 +5,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.humanoid_body import HumanoidBody, HumanoidBodyOptions
+from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.task import Memory, State
 
 

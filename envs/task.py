@@ -22,8 +22,7 @@ Memory = dict[str, jax.Array]
 """What a task remembers from the last step beside the physics state."""
 
 
-@flax.struct.dataclass
-class State:
+class State(flax.struct.PyTreeNode):
     """One copy of an environment. Lean by design: everything else is rebuilt inside the step."""
 
     physics: PhysicsState

@@ -58,9 +58,7 @@ class Walker2d(Task):
         # v4 pays the healthy reward on the step that ends the episode, too.
         is_paid = is_healthy | (options.terminate_when_unhealthy and options.version == "v4")
         terms = {
-            "reward_forward": options.forward_reward_weight
-            * (physics.qpos[0] - before.physics.qpos[0])
-            / self.dt,
+            "reward_forward": options.forward_reward_weight * (physics.qpos[0] - before.physics.qpos[0]) / self.dt,
             "reward_ctrl": -options.ctrl_cost_weight * jnp.square(action).sum(),
             "reward_survive": options.healthy_reward * is_paid,
         }

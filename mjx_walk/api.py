@@ -108,11 +108,11 @@ def train(config: Config, on_metrics: Callable[[Row], None] | None = None) -> tu
         The run folder, and the name of the signal that stopped the run early, if one did.
     """
     jax.config.update("jax_default_matmul_precision", config.matmul_precision)
-    if not jax.config.jax_compilation_cache_dir:
-        jax.config.update("jax_compilation_cache_dir", compile_cache_dir())
+    jax.config.update("jax_compilation_cache_dir", compile_cache_dir())
     config = dataclasses.replace(config, physics=resolve_engine(config.physics))
     task = make_task(config)
-    make_algorithm(task, config.num_envs, config.evaluation.num_envs, config.algo)  # refuses what does not fit, before a folder is made
+    # Refuses what does not fit before a folder is made.
+    make_algorithm(task, config.num_envs, config.evaluation.num_envs, config.algo)
     folder, config = run_folder.prepare(config)
     _announce(config, folder)
     trainer = Trainer(config, task, folder, on_metrics)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from mjx_walk import cli
 from mjx_walk.algos import make_algorithm
 from mjx_walk.api import make_task, resolve
-from mjx_walk.config import Config
+from mjx_walk.config import Config, compile_cache_dir
 from mjx_walk.envs import TASKS, State, Task
 from mjx_walk.envs.physics import make_engine, resolve_engine
 from mjx_walk.evaluation import versions
@@ -109,7 +109,7 @@ def gymnasium_speed(task: Task, seconds: float) -> float:
 
 
 _STEPS_PER_CALL = 25
-"""About as long as a random policy keeps a humanoid up; every call starts from fresh resets, as Gymnasium's episodes do."""
+"""About as long as a random policy keeps a humanoid up. Every call starts from resets, as Gymnasium's episodes do."""
 
 
 def _speed_under_random_actions(
@@ -148,7 +148,7 @@ def step_speed(task: Task, num_envs: int, seconds: float) -> float:
 def training_figures(config: Config, task: Task, seconds: float) -> dict[str, float]:
     """Training end to end as the loop runs it, and the compile time of its programs without and with a cache."""
     algorithm = make_algorithm(task, config.num_envs, config.evaluation.num_envs, config.algo)
-    old_cache = jax.config.jax_compilation_cache_dir
+    old_cache = compile_cache_dir()
     figures = {}
     with tempfile.TemporaryDirectory() as cache:
         jax.config.update("jax_compilation_cache_dir", cache)

@@ -35,7 +35,7 @@ def save(path: Path, tree: Any, meta: dict[str, Any]) -> None:
     meta = meta | {
         "format": FORMAT,
         "mjx_walk": mjx_walk.__version__,
-        "crc32": {name: zlib.crc32(np.ascontiguousarray(x)) for name, x in arrays.items()},
+        "crc32": {name: _crc32(x) for name, x in arrays.items()},
     }
     unfinished = path.with_name(f".{path.name}.unfinished")
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -74,7 +74,7 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
     except Exception as error:  # Orbax reports damage through many types
         raise ValueError(f"{path} is damaged: {str(error).splitlines()[0][:200]}") from error
     for name, crc in meta["crc32"].items():
-        if name not in arrays or zlib.crc32(np.ascontiguousarray(arrays[name])) != crc:
+        if name not in arrays or _crc32(arrays[name]) != crc:
             raise ValueError(f"{path} is damaged: {name} does not match its checksum")
     for name, leaf in wanted.items():
         if name not in arrays or arrays[name].shape != leaf.shape or arrays[name].dtype != leaf.dtype:
@@ -128,6 +128,10 @@ def prune(folder: Path, keep: int) -> None:
         shutil.rmtree(path)
     for path in folder.glob(".*.unfinished"):
         shutil.rmtree(path)
+
+
+def _crc32(array: np.ndarray) -> int:
+    return zlib.crc32(array.tobytes())
 
 
 def _named_leaves(tree: Any) -> dict[str, Any]:

@@ -163,9 +163,7 @@ def read_config(path: Path) -> Config:
     """
     try:
         saved = OmegaConf.load(path)
-        schema = OmegaConf.structured(
-            Config(env=TASKS[saved.env.name][1](), algo=ALGORITHMS[saved.algo.name][1]())
-        )
+        schema = OmegaConf.structured(Config(env=TASKS[saved.env.name][1](), algo=ALGORITHMS[saved.algo.name][1]()))
         return to_config(OmegaConf.merge(schema, saved))
     except (KeyError, AttributeError, yaml.YAMLError, OmegaConfBaseException) as error:
         raise UserError(f"{path} is not a configuration of this version: {_first_line(error)}") from error

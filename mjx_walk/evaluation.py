@@ -74,9 +74,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def score_in_gymnasium(
-    task: Task, act: Callable[[np.ndarray], np.ndarray], num_episodes: int, seed: int = 0
-) -> Scores:
+def score_in_gymnasium(task: Task, act: Callable[[np.ndarray], np.ndarray], num_episodes: int, seed: int = 0) -> Scores:
     """Whole episodes in `gymnasium.make`: CPU MuJoCo, float64, the model's own solver.
 
     The episodes run side by side, shared out over one process a core.

@@ -15,8 +15,7 @@ from mjx_walk.envs import State, Task
 from mjx_walk.types import Metrics, PolicyFn
 
 
-@flax.struct.dataclass
-class LiveEvaluation:
+class LiveEvaluation(flax.struct.PyTreeNode):
     """A round of episodes under a snapshot of the policy, and the best snapshot so far."""
 
     policy_params: Any

@@ -24,7 +24,9 @@ _SPEED_WINDOW = 10.0
 """Seconds that the logged speed is averaged over."""
 
 
-def make_chunk(algorithm: Algorithm, num_updates: int, fused: bool) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
+def make_chunk(
+    algorithm: Algorithm, num_updates: int, fused: bool
+) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
     """Compile `num_updates` updates into one call.
 
     Args:

@@ -94,7 +94,9 @@ def reference_states(task: Task, num_copies: int, num_steps: int, seed: int) -> 
     state = jax.vmap(task.reset_to)(start.qpos.at[:, height].add(lift), start.qvel)
 
     def one(state, key):
-        action = jax.random.uniform(key, (num_copies, task.action_size), minval=task.action_low, maxval=task.action_high)
+        action = jax.random.uniform(
+            key, (num_copies, task.action_size), minval=task.action_low, maxval=task.action_high
+        )
         return jax.vmap(task.step)(state, action), (state, action)
 
     _, visited = jax.lax.scan(one, state, jax.random.split(action_key, num_steps))
@@ -138,8 +140,8 @@ def _error(name: str, expected: np.ndarray, found: np.ndarray, kind: str = "othe
     if is_relative:
         difference /= 1.0 + np.abs(expected)
     worst = difference.max(axis=1)
-    figures = np.median(worst), np.quantile(difference, 0.99), np.quantile(worst, 0.99)
-    return Error(name, *map(float, figures), TOLERANCES[kind])
+    median, p99, p99_worst = np.median(worst), np.quantile(difference, 0.99), np.quantile(worst, 0.99)
+    return Error(name, float(median), float(p99), float(p99_worst), TOLERANCES[kind])
 
 
 def check(name: str, version: str, physics: str, num_copies: int, num_steps: int, seed: int = 0) -> Parity:

@@ -16,7 +16,7 @@ def restore_device_put_replicated() -> None:
         assert len(devices) == 1, "the stand-in serves one device"
         return jax.tree.map(lambda x: jax.device_put(jnp.asarray(x)[None], devices[0]), tree)
 
-    jax.device_put_replicated = device_put_replicated  # type: ignore[attr-defined]
+    jax.device_put_replicated = device_put_replicated  # type: ignore[assignment]
 
 
 def brax_ppo_speed(num_envs: int, num_timesteps: int) -> float:

@@ -25,8 +25,7 @@ def bootstrap_truncated(
     return reward + jnp.where(truncated, discount * next_value / reward_scale, 0.0)
 
 
-@flax.struct.dataclass
-class ReturnScale:
+class ReturnScale(flax.struct.PyTreeNode):
     """Running variance of the discounted return, by which rewards may be normalised.
 
     Source: `VecNormalize` of Stable-Baselines3 (`r / std(G)`, with `G ← γ G + r` running through each copy).

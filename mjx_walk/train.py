@@ -41,7 +41,8 @@ def _through_hydra(arguments: list[str]) -> None:
     """Hand flags to Hydra: sweeps, launchers, `--cfg`."""
     overrides = [a for a in arguments if not a.startswith("-") and ("=" in a or a[0] in "+~")]
     parsed = OverridesParser.create().parse_overrides(complete_overrides(overrides))
-    load_config([str(o.input_line) for o in parsed if not o.is_sweep_override() and not o.key_or_group.startswith("hydra")])
+    plain = [o for o in parsed if not o.is_sweep_override() and not o.key_or_group.startswith("hydra")]
+    load_config([str(o.input_line) for o in plain])  # says in one line what Hydra would say in many
     sys.argv = [sys.argv[0], *arguments, str(parsed[0].input_line)]
     os.environ["HYDRA_FULL_ERROR"] = "1"
     register_schemas()

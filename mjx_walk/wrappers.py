@@ -11,16 +11,14 @@ from mjx_walk.live_evaluation import LiveEvaluation, LiveEvaluator
 from mjx_walk.types import Metrics
 
 
-@flax.struct.dataclass
-class EpisodeSums:
+class EpisodeSums(flax.struct.PyTreeNode):
     """Sums over the current episode of each copy, `[B] f32`."""
 
     reward: jax.Array
     terms: dict[str, jax.Array]
 
 
-@flax.struct.dataclass
-class VectorState:
+class VectorState(flax.struct.PyTreeNode):
     """All copies, and the pool of random starts that copies whose episode has ended restart from."""
 
     env: State
@@ -74,7 +72,7 @@ class VectorEnv:
         pool = self._reset_many(pool_key)
         return VectorState(
             env=env,
-            sums=EpisodeSums(zeros, {name: zeros for name in self.task.reward_terms}),
+            sums=EpisodeSums(zeros, dict.fromkeys(self.task.reward_terms, zeros)),
             is_whole=env.steps == 0,
             pool=pool,
             pool_used=jnp.zeros((), jnp.int32),

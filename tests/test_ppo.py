@@ -111,11 +111,14 @@ def test_small_batch_training_learns(physics):
     assert late[0] / late[1] > 2.5 * early[0] / early[1]
 
 
-@pytest.mark.parametrize("changes", [
-    {"distribution": "normal"},
-    {"learning_rate_schedule": "adaptive_kl", "normalize_rewards": True},
-    {"max_value_grad_norm": 0.5, "entropy_schedule": "linear", "learning_rate_schedule": "linear"},
-])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"distribution": "normal"},
+        {"learning_rate_schedule": "adaptive_kl", "normalize_rewards": True},
+        {"max_value_grad_norm": 0.5, "entropy_schedule": "linear", "learning_rate_schedule": "linear"},
+    ],
+)
 def test_options_train(changes):
     task = make_env("walker2d", physics="c")
     algorithm = make_ppo(task, 8, 1, dataclasses.replace(SMALL, num_minibatches=2, **changes))

@@ -39,8 +39,10 @@ def test_n_and_n_chunks_equal_2n(tmp_path, physics):
     assert whole.keys() == halves.keys() and len(whole) > 50
     for name, leaf in whole.items():
         np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
-    assert not np.array_equal(whole["params.policy.params.hidden_0.kernel"],
-                              leaves(tmp_path / "halves", 3)["params.policy.params.hidden_0.kernel"])
+    assert not np.array_equal(
+        whole["params.policy.params.hidden_0.kernel"],
+        leaves(tmp_path / "halves", 3)["params.policy.params.hidden_0.kernel"],
+    )
     rows = [json.loads(line) for line in (tmp_path / "halves" / "metrics.jsonl").read_text().splitlines()]
     assert [row["env_steps"] for row in rows] == [i * TINY_CHUNK for i in range(1, 7)]
     seconds = [row["wall_seconds"] for row in rows]

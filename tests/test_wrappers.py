@@ -66,7 +66,7 @@ def test_truncated_copies_restart_from_different_starts_and_reuse_is_counted(wal
     reused = 0.0
     for round_ in range(2):
         state = state.replace(env=state.env.replace(steps=jnp.full(4, at_end)))
-        state, outcome, stats = step(state, jnp.zeros((4, 6)))
+        state, _, stats = step(state, jnp.zeros((4, 6)))
         assert stats["resets"] == 4
         assert len(np.unique(np.asarray(state.env.obs), axis=0)) == 4
         reused += float(stats["resets_reused"])

@@ -49,9 +49,13 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
         derived: the `mjData` arrays that the task reads.
     """
     if name == "warp":
-        from mjx_walk.envs.physics.mjx_warp import WarpEngine as EngineClass
-    elif name == "jax":
-        from mjx_walk.envs.physics.mjx_jax import JaxEngine as EngineClass
-    else:
-        from mjx_walk.envs.physics.mujoco_c import CEngine as EngineClass
-    return EngineClass(model, num_substeps, derived)
+        from mjx_walk.envs.physics.mjx_warp import WarpEngine
+
+        return WarpEngine(model, num_substeps, derived)
+    if name == "jax":
+        from mjx_walk.envs.physics.mjx_jax import JaxEngine
+
+        return JaxEngine(model, num_substeps, derived)
+    from mjx_walk.envs.physics.mujoco_c import CEngine
+
+    return CEngine(model, num_substeps, derived)

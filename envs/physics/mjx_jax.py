@@ -41,9 +41,7 @@ class JaxEngine:
         """Advance by `num_substeps`; see `Engine.step`. Nothing overflows: every possible contact has its place."""
         with jax.default_matmul_precision("highest"):
             data = self._data(state).replace(ctrl=ctrl)
-            data, _ = jax.lax.scan(
-                lambda d, _: (_runge_kutta_4(self._model, d), None), data, length=self._num_substeps
-            )
+            data, _ = jax.lax.scan(lambda d, _: (_runge_kutta_4(self._model, d), None), data, length=self._num_substeps)
             if "cfrc_ext" in self._derived:
                 data = mjx_smooth.rne_postconstraint(self._model, data)
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)

@@ -35,9 +35,7 @@ class WarpEngine:
         self._model = mjx.put_model(self._mj_model, impl="warp", device=jax.local_devices()[0]).tree_replace(
             {"opt._impl.warn_overflow": 0}
         )
-        self._last_model = self._model.tree_replace(
-            {"opt._impl.run_rne_postconstraint": "cfrc_ext" in derived}
-        )
+        self._last_model = self._model.tree_replace({"opt._impl.run_rne_postconstraint": "cfrc_ext" in derived})
         self._num_substeps = num_substeps
         self._derived = derived
         self.forward = batch_once(self._forward)

@@ -39,13 +39,14 @@ class CEngine:
 
     def _step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Derived, jax.Array]:
         result = self._result_shapes(len(ctrl))
-        return jax.pure_callback(self._host_step, result, *state, ctrl)
+        next_state, derived, overflow = jax.pure_callback(self._host_step, result, *state, ctrl)
+        return PhysicsState(*next_state), derived, overflow
 
     def _result_shapes(self, num_copies: int):
         def array(*shape, dtype=np.float32):
             return jax.ShapeDtypeStruct((num_copies, *shape), dtype)
 
-        state = PhysicsState(array(self._model.nq), array(self._model.nv), array(self._model.nv))
+        state = (array(self._model.nq), array(self._model.nv), array(self._model.nv))
         return state, {name: array(*shape) for name, shape in self._shapes.items()}, array(dtype=np.bool_)
 
     def _host_forward(self, qpos, qvel, warmstart) -> dict[str, np.ndarray]:
@@ -63,7 +64,7 @@ class CEngine:
 
     def _host_step(self, qpos, qvel, warmstart, ctrl):
         qpos, qvel, warmstart, ctrl = (np.asarray(x, np.float64) for x in (qpos, qvel, warmstart, ctrl))
-        state = PhysicsState(*(np.empty(x.shape, np.float32) for x in (qpos, qvel, warmstart)))
+        state = tuple(np.empty(x.shape, np.float32) for x in (qpos, qvel, warmstart))
         derived = self._empty_derived(len(qpos))
 
         def one(data: mujoco.MjData, i: int) -> None:

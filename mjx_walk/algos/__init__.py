@@ -1,6 +1,5 @@
 """One file an algorithm; this one only finds them."""
 
-import dataclasses
 from typing import Any
 
 from mjx_walk.algos.ppo import PPOConfig, make_ppo
@@ -14,5 +13,4 @@ __all__ = ["ALGORITHMS", "make_algorithm"]
 
 def make_algorithm(task: Task, num_envs: int, num_eval_envs: int, config: Any) -> Algorithm:
     """Build the algorithm that the config's type belongs to."""
-    assert dataclasses.is_dataclass(config)
     return ALGORITHMS[config.name][0](task, num_envs, num_eval_envs, config)

@@ -66,8 +66,7 @@ class PPOConfig:
     stagger_episodes: bool = True
 
 
-@flax.struct.dataclass
-class PPOState:
+class PPOState(flax.struct.PyTreeNode):
     """Everything that influences PPO's next update."""
 
     params: ppo_losses.PPONetworkParams
@@ -82,8 +81,7 @@ class PPOState:
     """`[] i32`: updates done."""
 
 
-@flax.struct.dataclass
-class PPOBatch:
+class PPOBatch(flax.struct.PyTreeNode):
     """What one `collect` hands to `learn`; N pieces of T steps."""
 
     transitions: Transition

@@ -61,7 +61,7 @@ def test_every_step_of_a_long_trajectory(name, version):
 def test_reset_observation(name, version):
     task = make_env(name, physics="c", version=version)
     real = real_env(task)
-    obs, _ = real.reset(seed=3)
+    real.reset(seed=3)
     qpos, qvel = np.float32(real.data.qpos), np.float32(real.data.qvel)
     real.set_state(np.float64(qpos), np.float64(qvel))
     np.testing.assert_array_equal(task.reset_to(qpos, qvel).obs, np.float32(real._get_obs()))

@@ -1,5 +1,8 @@
 """Purity, vmap, and the guard against broken physics."""
 
+from pathlib import Path
+
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -75,10 +78,8 @@ def test_mistakes_are_named(kwargs, says):
 
 
 def test_own_model_file(tmp_path):
-    import gymnasium
-
-    source = f"{gymnasium.__path__[0]}/envs/mujoco/assets/walker2d_v5.xml"
-    text = open(source).read().replace('timestep="0.002"', 'timestep="0.001"')
+    source = Path(gymnasium.__path__[0]) / "envs" / "mujoco" / "assets" / "walker2d_v5.xml"
+    text = source.read_text().replace('timestep="0.002"', 'timestep="0.001"')
     own = tmp_path / "own.xml"
     own.write_text(text)
     task = make_env("walker2d", physics="c", xml_file=str(own))
