@@ -195,13 +195,15 @@ class Task(abc.ABC):
             (physics, memory, obs),
             (state.physics, state.memory, state.obs),
         )
-        terms = {name: jnp.where(is_sound, value, 0.0) for name, value in terms.items()}
+        # A strong zero: weakly typed metrics would have every program compiled twice.
+        zero = jnp.float32(0.0)
+        terms = {name: jnp.where(is_sound, value, zero) for name, value in terms.items()}
         steps = state.steps + 1
         return State(
             physics=physics,
             memory=memory,
             obs=obs,
-            reward=jnp.where(is_sound, reward, 0.0),
+            reward=jnp.where(is_sound, reward, zero),
             terminated=terminated | ~is_sound,
             truncated=steps >= self.options.max_episode_steps,
             steps=steps,

@@ -21,7 +21,7 @@ from mjx_walk.config import Config, compile_cache_dir
 from mjx_walk.envs import TASKS, State, Task
 from mjx_walk.envs.physics import make_engine, resolve_engine
 from mjx_walk.evaluation import versions
-from mjx_walk.loop import make_chunk
+from mjx_walk.loop import make_chunk, make_init
 from mjx_walk.peers import brax_ppo_speed
 from mjx_walk.settings import setting
 
@@ -157,7 +157,7 @@ def training_figures(config: Config, task: Task, seconds: float) -> dict[str, fl
             jax.experimental.compilation_cache.compilation_cache.reset_cache()
             start = time.monotonic()
             chunk = make_chunk(algorithm, 1, fused=task.engine.name != "c")
-            state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
+            state = make_init(algorithm)(jax.random.PRNGKey(0))
             state = jax.block_until_ready(chunk(state)[0])
             figures[name] = time.monotonic() - start
         jax.config.update("jax_compilation_cache_dir", old_cache)

@@ -20,13 +20,24 @@ from mjx_walk.policies import load_best_policy, save_best_policy
 from mjx_walk.run_folder import RunFolder
 from mjx_walk.types import Algorithm, Metrics, TrainState
 
+Chunk = Callable[[TrainState], tuple[TrainState, Metrics]]
+
+Chunk = Callable[[TrainState], tuple[TrainState, Metrics]]
+
 _SPEED_WINDOW = 10.0
 """Seconds that the logged speed is averaged over."""
 
 
-def make_chunk(
-    algorithm: Algorithm, num_updates: int, fused: bool
-) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
+def make_init(algorithm: Algorithm) -> Callable[[jax.Array], TrainState]:
+    """Compile `key → TrainState`, without weak types, with which the first chunk would be compiled a second time."""
+
+    def init(key):
+        return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), algorithm.init(key))
+
+    return jax.jit(init)
+
+
+def make_chunk(algorithm: Algorithm, num_updates: int, fused: bool) -> Chunk:
     """Compile `num_updates` updates into one call.
 
     Args:
@@ -149,10 +160,10 @@ class Trainer:
 
     def _start(self) -> tuple[TrainState, int]:
         """The TrainState to begin with, and the number of chunks behind it."""
-        init = jax.jit(self.algorithm.init)
+        init = make_init(self.algorithm)
         key = jax.random.PRNGKey(self.config.seed)
         if not self.config.resume:
-            return _strong(init(key)), 0
+            return init(key), 0
         state, meta = checkpoint.restore_newest(self.folder.checkpoints, jax.eval_shape(init, key))
         self._seconds_before = meta["wall_seconds"]
         self._best_return = float(state.env.live.best_return)
@@ -190,8 +201,3 @@ class Trainer:
             env_steps = int(live.best_update) * self.algorithm.steps_per_update
             best_facts = {"env_steps": env_steps, "eval_return": self._best_return}
             save_best_policy(self.folder, live.best_policy_params, best_facts)
-
-
-def _strong(tree: Any) -> Any:
-    """Drop weak types, with which the first chunk would be compiled a second time."""
-    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), tree)

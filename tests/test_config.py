@@ -1,0 +1,43 @@
+"""Configurations: every recipe composes and fits its algorithm; what is saved is what is read."""
+
+from pathlib import Path
+
+import pytest
+
+from mjx_walk.algos import make_algorithm
+from mjx_walk.api import make_task
+from mjx_walk.config import CONFIG_DIR, flatten, load_config, read_config, save_config
+
+RECIPES = sorted(
+    str(path.relative_to(f"{CONFIG_DIR}/recipe"))[:-5] for path in Path(CONFIG_DIR).glob("recipe/*/*.yaml")
+)
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_every_recipe_fits(recipe):
+    hardware, _, name = recipe.partition("/")
+    env, _, algo = name.rpartition("_")
+    config = load_config([f"env={env}", f"algo={algo}", f"hardware={hardware}", "physics=c"])
+    assert (config.env.name, config.algo.name, config.hardware) == (env, algo, hardware)
+    assert config.algo.schedule_steps == config.total_steps  # annealed to the end, unless it is stopped early
+    algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation.num_envs, config.algo)
+    assert algorithm.steps_per_update * config.updates_per_chunk < config.total_steps / 20
+
+
+def test_there_is_a_recipe_for_every_task_on_every_hardware():
+    assert len(RECIPES) == 6
+
+
+def test_without_an_accelerator_the_small_recipe_is_chosen():
+    assert load_config([]).hardware == "cpu" and load_config(["hardware=gpu"]).num_envs == 16384
+    assert load_config([]).num_envs == load_config(["hardware=cpu"]).num_envs == 128
+
+
+def test_overrides_beat_the_recipe(tmp_path):
+    config = load_config(["env=walker2d", "num_envs=32", "algo.discount=0.9", "env.healthy_z_range=[0.5, 3]"])
+    assert (config.num_envs, config.algo.discount, config.env.healthy_z_range) == (32, 0.9, (0.5, 3.0))
+    save_config(config, tmp_path / "config.yaml")
+    assert flatten(read_config(tmp_path / "config.yaml")) == flatten(config)
+    humanoid = load_config(["env.version=v4"])
+    save_config(humanoid, tmp_path / "config.yaml")  # with its infinite contact_cost_range
+    assert read_config(tmp_path / "config.yaml") == humanoid

@@ -1,0 +1,149 @@
+"""A run from end to end: what is in its folder, and what its numbers mean."""
+
+import json
+import math
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from commands import TINY, TINY_CHUNK, command
+from tensorboardX.proto.event_pb2 import Event
+
+import mjx_walk
+from mjx_walk import train as train_command
+from mjx_walk.algos import make_algorithm
+from mjx_walk.api import make_task
+from mjx_walk.config import load_config
+from mjx_walk.loop import make_chunk, make_init
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A small run through the Python interface, with the rows it reported."""
+    rows = []
+    path = tmp_path_factory.mktemp("runs") / "run"
+    overrides = [*TINY, f"run_dir={path}", f"total_steps={60 * TINY_CHUNK}", "env.max_episode_steps=40"]
+    run = mjx_walk.run([*overrides, "evaluation.gymnasium_episodes=3"], on_metrics=rows.append)
+    return run, rows
+
+
+def test_the_folder_holds_what_it_should(finished):
+    run, _ = finished
+    names = {path.name for path in run.path.iterdir()}
+    assert {"config.yaml", "metrics.jsonl", "checkpoints", "eval_gymnasium.json"} <= names
+    for name in ("learning_curve.png", "reward_terms.png", "losses.png"):
+        assert (run.path / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+        assert (run.path / name).stat().st_size > 10_000
+    steps = sorted(path.name for path in (run.path / "checkpoints").iterdir())
+    assert steps == [f"{chunk * TINY_CHUNK:013d}" for chunk in (56, 58, 60)] + ["best"]
+
+
+def test_metrics_name_everything(finished):
+    run, rows = finished
+    assert run.metrics == json.loads(json.dumps(rows))
+    assert [row["env_steps"] for row in rows] == [TINY_CHUNK * (i + 1) for i in range(60)]
+    needed = {
+        "episode/return", "episode/length", "episode/reward_forward", "episode/reward_ctrl", "episode/reward_survive",
+        "train/loss", "train/policy_loss", "train/value_loss", "train/kl", "train/entropy", "train/learning_rate",
+        "speed/steps_per_second", "physics/nonfinite", "physics/overflow", "resets/reuse_rate", "eval/return",
+        "eval/length", "wall_seconds",
+    }  # fmt: skip
+    assert needed <= {name for row in rows for name in row}
+    for row in rows:
+        if row["episode/count"]:
+            terms = row["episode/reward_forward"] + row["episode/reward_ctrl"] + row["episode/reward_survive"]
+            assert terms == pytest.approx(row["episode/return"], rel=1e-4, abs=1e-3)
+    evaluated = [row for row in rows if "eval/return" in row]
+    assert len(evaluated) > 5 and all(row["eval/env_steps"] < row["env_steps"] for row in evaluated)
+
+
+def test_tensorboard_holds_the_same(finished):
+    run, rows = finished
+    data = next(run.path.glob("events.*")).read_bytes()
+    values, at = {}, 0
+    while at < len(data):  # TFRecord: length, its checksum, the event, its checksum
+        size = int.from_bytes(data[at : at + 8], "little")
+        event = Event.FromString(data[at + 12 : at + 12 + size])
+        values |= {(value.tag, event.step): value.simple_value for value in event.summary.value}
+        at += size + 16
+    for row in rows[:: len(rows) // 5]:
+        for name in ("train/loss", "speed/steps_per_second"):
+            assert values[name, row["env_steps"]] == pytest.approx(row[name], rel=1e-5)
+
+
+def test_gymnasium_scores_are_those_of_a_plain_loop(finished):
+    """The file's episodes, played again by the reader's own ten lines."""
+    run, _ = finished
+    content = json.loads((run.path / "eval_gymnasium.json").read_text())
+    assert content["env"] == "Walker2d-v5" and content["seeds"] == [0, 1, 2] and "mujoco" in content["versions"]
+    for seed, expected, length in zip(content["seeds"], content["returns"], content["lengths"], strict=True):
+        env = gymnasium.make("Walker2d-v5", max_episode_steps=40)
+        obs, _ = env.reset(seed=seed)
+        total, steps, done = 0.0, 0, False
+        while not done:
+            obs, reward, terminated, truncated, _ = env.step(run.policy(obs))
+            total, steps, done = total + reward, steps + 1, terminated or truncated
+        assert (total, steps) == (pytest.approx(expected, rel=1e-6), length)
+    assert content["mean"] == pytest.approx(np.mean(content["returns"]))
+
+
+def test_a_loaded_policy_scores_alike_in_its_engine_and_in_gymnasium(finished):
+    run, _ = finished
+    loaded = mjx_walk.load_run(run.path)
+    sim, real = loaded.evaluate(64, backend="sim"), loaded.evaluate(64, backend="gymnasium")
+    error = math.hypot(sim.std, real.std) / 8
+    assert abs(sim.mean - real.mean) < max(4 * error, 0.02 * abs(real.mean))
+
+
+def test_eval_command(finished):
+    run, _ = finished
+    done = command("eval", f"run={run.path}", "episodes=2", "backend=sim")
+    assert done.returncode == 0 and "Walker2d-v5 on c" in done.stdout
+
+
+def test_the_same_seed_gives_the_same_run_and_another_does_not(tmp_path):
+    losses = []
+    for i, seed in enumerate((1, 1, 2)):
+        run = [*TINY, f"run_dir={tmp_path}/{i}", f"total_steps={2 * TINY_CHUNK}", f"seed={seed}"]
+        losses.append([row["train/loss"] for row in mjx_walk.run(run).metrics])
+    assert losses[0] == losses[1] != losses[2]
+
+
+def test_nothing_is_compiled_twice():
+    config = load_config([*TINY, "physics=c"])
+    task = make_task(config)
+    traces = 0
+    step = task.step
+
+    def counted(state, action):
+        nonlocal traces
+        traces += 1
+        return step(state, action)
+
+    task.step = counted
+    algorithm = make_algorithm(task, config.num_envs, config.evaluation.num_envs, config.algo)
+    chunk = make_chunk(algorithm, 2, fused=True)
+    state = make_init(algorithm)(jax.random.PRNGKey(0))
+    state, _ = chunk(state)
+    after_first = traces
+    for _ in range(3):
+        state, metrics = chunk(state)
+    assert traces == after_first and metrics["loss"].shape == (2,)
+    assert chunk._cache_size() == 1
+
+
+def test_a_sweep_puts_each_job_in_its_own_folder(tmp_path):
+    arguments = [*TINY, f"total_steps={TINY_CHUNK}"]
+    done = command("train", "-m", "seed=0,1", *arguments, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert len(list(tmp_path.glob("runs/sweeps/*/*/metrics.jsonl"))) == 2
+    # One job of a sweep that fails does not end the others.
+    done = command("train", "-m", "num_envs=7,8", *arguments[:1], *arguments[2:], cwd=tmp_path)
+    assert done.returncode == 2 and "choose num_envs a multiple of 2" in done.stderr and "Traceback" not in done.stderr
+    assert len(list(tmp_path.glob("runs/sweeps/*/*/metrics.jsonl"))) == 3
+
+
+def test_configuration_can_be_printed(capsys):
+    assert train_command.main(["--help"]) == 0
+    assert "usage: python -m mjx_walk.train" in capsys.readouterr().out
