@@ -2,6 +2,7 @@
 
 import collections
 import math
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -93,6 +94,7 @@ class Trainer:
         self._times: collections.deque[tuple[float, int]] = collections.deque()
         self._seconds_before = 0.0
         self._best_return = -float("inf")
+        self._has_warned = False
 
     def train(self) -> str | None:
         """Train to the end, or until a signal asks to stop.
@@ -111,6 +113,7 @@ class Trainer:
             row = self._row(chunk, metrics)
             writer.write(row)
             progress.update(row)
+            self._warn_of_overflow(row)
             self._on_metrics(row)
 
         with Interrupt() as interrupt:
@@ -173,6 +176,16 @@ class Trainer:
         row = name_metrics(jax.device_get(metrics), self.task.reward_terms, self.algorithm.steps_per_update)
         row["speed/steps_per_second"] = self._speed(chunk)
         return {"env_steps": chunk * self.steps_per_chunk, "wall_seconds": self._seconds(), **row}
+
+    def _warn_of_overflow(self, row: Row) -> None:
+        if row["physics/overflow"] and not self._has_warned:
+            self._has_warned = True
+            print(
+                "warning: a Warp buffer overflowed, so that contacts were lost in some copies; the count is in the "
+                "metrics as physics/overflow. Enlarge CONTACTS_PER_COPY or CONSTRAINTS_PER_COPY in "
+                "envs/physics/mjx_warp.py",
+                file=sys.stderr,
+            )
 
     def _speed(self, chunk: int) -> float:
         """Steps per second over the last `_SPEED_WINDOW` seconds or so, evaluation and saving included."""

@@ -12,5 +12,5 @@ __all__ = ["ALGORITHMS", "make_algorithm"]
 
 
 def make_algorithm(task: Task, num_envs: int, num_eval_envs: int, config: Any) -> Algorithm:
-    """Build the algorithm that the config's type belongs to."""
-    return ALGORITHMS[config.name][0](task, num_envs, num_eval_envs, config)
+    """Build the algorithm that the settings are of, with at most one evaluation copy for each that learns."""
+    return ALGORITHMS[config.name][0](task, num_envs, min(num_eval_envs, num_envs), config)

@@ -1,0 +1,109 @@
+"""The package works in every way people use it: editable, from a wheel or sdist, beside a clone, and from one."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+CLONE = Path(__file__).parent.parent
+
+USE = """
+import mjx_walk, sys
+assert "jax" not in sys.modules, "import mjx_walk should be light"
+from mjx_walk.config import load_config
+from mjx_walk.envs import TASKS
+assert load_config(["env=walker2d"]).num_envs == 128
+env = mjx_walk.make_env("walker2d", physics="c")
+assert type(env) is TASKS["walker2d"][0] and env.observation_size == 17
+print(mjx_walk.__file__)
+"""
+
+
+def python_use(cwd, paths=(), executable=sys.executable):
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths)), "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [executable, "-c", USE], cwd=cwd, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return Path(done.stdout.split()[-1])
+
+
+@pytest.fixture(scope="module")
+def clone(tmp_path_factory):
+    """A plain clone: what git tracks, nothing else."""
+    path = tmp_path_factory.mktemp("clone") / "mjx_walk_clone"
+    files = subprocess.run(["git", "ls-files", "-z"], cwd=CLONE, capture_output=True, text=True, check=True).stdout
+    for name in filter(None, files.split("\0")):
+        target = path / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(CLONE / name, target, follow_symlinks=False)
+    return path
+
+
+@pytest.fixture(scope="module")
+def built(clone, tmp_path_factory):
+    """Wheel and sdist, and the wheel built from the sdist."""
+    out = tmp_path_factory.mktemp("dist")
+    subprocess.run(
+        [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(clone)],
+        check=True,
+        capture_output=True,
+    )
+    return next(out.glob("*.whl")), next(out.glob("*.tar.gz"))
+
+
+@pytest.fixture(scope="module")
+def installed(built, tmp_path_factory):
+    """The wheel, in a folder of its own."""
+    target = tmp_path_factory.mktemp("installed")
+    with zipfile.ZipFile(built[0]) as wheel:
+        wheel.extractall(target)
+    return target
+
+
+def test_wheel_and_sdist_hold_the_package_and_nothing_else(built):
+    names = zipfile.ZipFile(built[0]).namelist()
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"mjx_walk"}
+    needed = {
+        "mjx_walk/envs/humanoid.py",
+        "mjx_walk/configs/train.yaml",
+        "mjx_walk/configs/recipe/gpu/humanoid_ppo.yaml",
+    }
+    assert needed <= set(names)
+    assert not [name for name in names if name.endswith(".xml")]  # Gymnasium's models stay Gymnasium's
+    with tarfile.open(built[1]) as sdist:
+        inside = {name.partition("/")[2] for name in sdist.getnames()}
+    assert {"mjx_walk/envs/humanoid.py", "mjx_walk/configs/train.yaml", "LICENSE", "README.md"} <= inside
+
+
+def test_wheel_from_elsewhere(installed, tmp_path):
+    assert python_use(tmp_path, [installed]).is_relative_to(installed)
+
+
+def test_wheel_with_the_clone_as_current_folder(installed, clone):
+    assert python_use(clone, [installed]).is_relative_to(clone)  # Python takes the current folder first
+
+
+def test_plain_clone(clone):
+    assert python_use(clone).is_relative_to(clone)
+
+
+def test_editable(clone, tmp_path):
+    venv.create(tmp_path / "venv", with_pip=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    site = next((tmp_path / "venv" / "lib").glob("python*")) / "site-packages"
+    for path in [*site.glob("setuptools*"), *site.glob("pkg_resources")]:  # Python 3.11 brings one that is too old
+        shutil.rmtree(path)
+    (site / "dependencies.pth").write_text("\n".join(path for path in sys.path if "site-packages" in path))
+    subprocess.run(
+        [python, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "-e", str(clone)],
+        check=True,
+        capture_output=True,
+    )
+    assert python_use(tmp_path, executable=python).is_relative_to(clone)
