@@ -23,8 +23,6 @@ from mjx_walk.types import Algorithm, Metrics, TrainState
 
 Chunk = Callable[[TrainState], tuple[TrainState, Metrics]]
 
-Chunk = Callable[[TrainState], tuple[TrainState, Metrics]]
-
 _SPEED_WINDOW = 10.0
 """Seconds that the logged speed is averaged over."""
 

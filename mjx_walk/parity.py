@@ -103,32 +103,34 @@ def reference_states(task: Task, num_copies: int, num_steps: int, seed: int) -> 
     return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), visited)
 
 
-def compare(reference: Task, engine: Task, states: State, actions: jax.Array) -> Parity:
-    """Take one step from each state with both engines.
+def one_step(task: Task, states: State, actions: jax.Array) -> State:
+    """The states, `[N, …]`, after one step, on the host."""
+    return jax.device_get(jax.jit(jax.vmap(task.step))(states, actions))
+
+
+def compare(task: Task, expected: State, found: State) -> Parity:
+    """Hold two engines' outcomes of the same steps against each other.
 
     Args:
-        reference: the task on the `c` engine.
-        engine: the same task on an MJX engine.
-        states: `[N, …]`, of the reference.
-        actions: `[N, action_size]`.
+        task: on either engine.
+        expected: `[N, …]`, the reference's.
+        found: `[N, …]`, the engine's.
     """
-    expected = jax.device_get(jax.jit(jax.vmap(reference.step))(states, actions))
-    found = jax.device_get(jax.jit(jax.vmap(engine.step))(states, actions))
     errors = [
         _error("qpos", expected.physics.qpos, found.physics.qpos, "qpos", is_relative=False),
         _error("qvel", expected.physics.qvel, found.physics.qvel, "qvel", is_relative=False),
     ]
     start = 0
-    for name, size in reference.observation_blocks().items():
+    for name, size in task.observation_blocks().items():
         block = np.s_[:, start : start + size]
         errors.append(_error(f"obs {name}", expected.obs[block], found.obs[block]))
         start += size
-    for name in reference.reward_terms:
+    for name in task.reward_terms:
         errors.append(_error(name, expected.metrics[name][:, None], found.metrics[name][:, None]))
     errors.append(_error("reward", expected.reward[:, None], found.reward[:, None]))
     return Parity(
         errors,
-        num_steps=len(actions),
+        num_steps=len(expected.reward),
         num_terminations=int(expected.terminated.sum()),
         termination_mismatches=int((expected.terminated != found.terminated).sum()),
         overflows=int(found.metrics["overflow"].sum()),
@@ -150,7 +152,9 @@ def check(name: str, version: str, physics: str, num_copies: int, num_steps: int
     with jax.default_device(cpu):
         reference = make_env(name, physics="c", version=version)
         states, actions = jax.device_get(reference_states(reference, num_copies, num_steps, seed))
-    return compare(reference, make_env(name, physics=physics, version=version), states, actions)
+        expected = one_step(reference, states, actions)
+    engine = make_env(name, physics=physics, version=version)
+    return compare(engine, expected, one_step(engine, states, actions))
 
 
 def main(arguments: list[str]) -> int:

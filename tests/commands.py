@@ -26,7 +26,7 @@ def command(module: str, *arguments: str, **kwargs) -> subprocess.CompletedProce
         [sys.executable, "-m", f"mjx_walk.{module}", *arguments],
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=kwargs.pop("timeout", 600),
         env=environment,
         check=False,
         **kwargs,

@@ -35,7 +35,7 @@ CASES = [
     (["env.frame_skip=0"], "env.frame_skip=0: must be at least 1"),
     (["env.reset_noise_scale=-1"], "must be at least 0"),
     (["env.xml_file=nowhere.xml"], "model file not found"),
-    (["num_envs=7"], "choose num_envs a multiple of 8"),
+    (["num_envs=7"], "choose num_envs a multiple of 16"),
     (["resume=true"], "resume=true needs run_dir"),
     (["resume=true", "run_dir=/nowhere/at/all"], "no run at '/nowhere/at/all'"),
 ]

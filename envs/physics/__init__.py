@@ -14,7 +14,7 @@ __all__ = ["ENGINES", "Derived", "Engine", "PhysicsState", "make_engine", "resol
 
 
 def resolve_engine(name: str) -> str:
-    """The engine that `name` stands for on this machine.
+    """The engine that `name` stands for on JAX's default device.
 
     Args:
         name: an engine, or `auto`: `warp` on an NVIDIA GPU where Warp is installed, `jax` on any other
@@ -23,12 +23,13 @@ def resolve_engine(name: str) -> str:
     Raises:
         UserError: the name is unknown, Warp is not installed, or `c` is asked for on an accelerator.
     """
-    platform = jax.default_backend()
+    device = jax.config.jax_default_device or jax.devices()[0]  # type: ignore[attr-defined]
+    platform = device.platform
     has_warp = importlib.util.find_spec("warp") is not None
     if name == "auto":
         if platform == "cpu":
             return "c"
-        is_nvidia = platform == "gpu" and "nvidia" in jax.devices()[0].device_kind.lower()
+        is_nvidia = platform == "gpu" and "nvidia" in device.device_kind.lower()
         return "warp" if is_nvidia and has_warp else "jax"
     if name not in ENGINES:
         raise UserError(f"unknown physics '{name}'; choose one of: auto, {', '.join(ENGINES)}")

@@ -9,6 +9,7 @@ import numpy as np
 
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 
+_BAD_STATE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{array}")) for array in ("QPOS", "QVEL", "QACC")]
 _MIN_COPIES_PER_TASK = 8
 """Below this a thread's start costs more than it saves."""
 
@@ -70,14 +71,13 @@ class CEngine:
         def one(data: mujoco.MjData, i: int) -> None:
             data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos[i], qvel[i], warmstart[i]
             data.ctrl[:] = ctrl[i]
-            data.time = 0.0
             mujoco.mj_step(self._model, data, nstep=self._num_substeps)
             mujoco.mj_rnePostConstraint(self._model, data)
             for target, source in zip(state, (data.qpos, data.qvel, data.qacc_warmstart), strict=True):
                 target[i] = source
             self._store(data, derived, i)
-            if data.time < (self._num_substeps - 0.5) * self._model.opt.timestep:
-                # MuJoCo met a bad state and reset itself, clock included. Say so as the MJX engines do.
+            if data.warning.number[_BAD_STATE].any():
+                # MuJoCo met a bad state, reset itself and went on. Say so as the MJX engines do.
                 for target in state:
                     target[i] = np.nan
                 mujoco.mj_resetData(self._model, data)
