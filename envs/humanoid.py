@@ -8,13 +8,14 @@ import jax.numpy as jnp
 from mjx_walk.envs.humanoid_body import HumanoidBody, HumanoidBodyOptions
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.task import Memory, State
+from mjx_walk.settings import setting
 
 
 @dataclasses.dataclass
 class HumanoidOptions(HumanoidBodyOptions):
     """Keywords of Gymnasium's `HumanoidEnv`. In v4 there is no contact cost, and its keywords have no effect."""
 
-    name: str = "humanoid"
+    name: str = setting("humanoid", choices=("humanoid",))
     forward_reward_weight: float = 1.25
     ctrl_cost_weight: float = 0.1
     contact_cost_weight: float = 5e-7

@@ -8,7 +8,6 @@ import mujoco
 
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.task import Task, TaskOptions
-from mjx_walk.errors import UserError
 
 NUM_ROOT_DOFS = 6
 """Degrees of freedom of the free root joint, which has no motor."""
@@ -27,25 +26,15 @@ class HumanoidBodyOptions(TaskOptions):
 class HumanoidBody(Task):
     """Observation and contact cost of the 17-motor humanoid."""
 
-    V5_ONLY: tuple[str, ...] = (
-        "xml_file",
-        "frame_skip",
+    V5_ONLY = (
+        *Task.V5_ONLY,
         "include_cinert_in_observation",
         "include_cvel_in_observation",
         "include_qfrc_actuator_in_observation",
         "include_cfrc_ext_in_observation",
     )
-    """Keywords that Gymnasium's v4 class does not take."""
 
     options: HumanoidBodyOptions
-
-    def __init__(self, options: HumanoidBodyOptions, physics: str = "auto"):
-        if options.version == "v4":
-            defaults = type(options)()
-            changed = [name for name in self.V5_ONLY if getattr(options, name) != getattr(defaults, name)]
-            if changed:
-                raise UserError(f"{options.name} v4 does not take {', '.join(changed)}; use version=v5")
-        super().__init__(options, physics)
 
     def observed_arrays(self) -> tuple[str, ...]:
         """The observation's `mjData` arrays after positions and velocities, in order."""

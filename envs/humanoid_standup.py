@@ -8,13 +8,14 @@ import jax.numpy as jnp
 from mjx_walk.envs.humanoid_body import HumanoidBody, HumanoidBodyOptions
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.task import Memory, State
+from mjx_walk.settings import setting
 
 
 @dataclasses.dataclass
 class HumanoidStandupOptions(HumanoidBodyOptions):
     """Keywords of Gymnasium's `HumanoidStandupEnv`. v4 takes none of them."""
 
-    name: str = "humanoid_standup"
+    name: str = setting("humanoid_standup", choices=("humanoid_standup",))
     uph_cost_weight: float = 1.0
     """Stored and never used, as in Gymnasium."""
     ctrl_cost_weight: float = 0.1

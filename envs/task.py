@@ -72,6 +72,8 @@ class Task(abc.ABC):
     """The model of each version, in Gymnasium's assets."""
     REWARD_TERMS: dict[str, tuple[str, ...]]
     """Signed reward terms of each version, under the names of Gymnasium's `info`."""
+    V5_ONLY: tuple[str, ...] = ("xml_file", "frame_skip")
+    """Keywords that Gymnasium's v4 class does not take."""
 
     def __init__(self, options: TaskOptions, physics: str = "auto"):
         """
@@ -80,10 +82,15 @@ class Task(abc.ABC):
             physics: engine name, or `auto`.
 
         Raises:
-            UserError: an unknown version or engine, or a model file that is not there.
+            UserError: an unknown version or engine, a keyword that v4 does not take, or a model file that is not
+                there.
         """
         if options.version not in self.XML_FILES:
             raise UserError(f"unknown version '{options.version}' of {options.name}; choose one of: v5, v4")
+        defaults = type(options)()
+        changed = [name for name in self.V5_ONLY if getattr(options, name) != getattr(defaults, name)]
+        if options.version == "v4" and changed:
+            raise UserError(f"{options.name} v4 does not take {', '.join(changed)}; use version=v5")
         self.options = options
         self.model = load_model(options.xml_file or self.XML_FILES[options.version])
         self.dt = self.model.opt.timestep * options.frame_skip

@@ -17,7 +17,7 @@ MAX_OBSERVED_VELOCITY = 10.0
 class Walker2dOptions(TaskOptions):
     """Keywords of Gymnasium's `Walker2dEnv`."""
 
-    name: str = "walker2d"
+    name: str = setting("walker2d", choices=("walker2d",))
     frame_skip: int = setting(4, at_least=1)
     reset_noise_scale: float = setting(5e-3, at_least=0)
     forward_reward_weight: float = 1.0

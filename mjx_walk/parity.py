@@ -137,7 +137,7 @@ def compare(task: Task, expected: State, found: State) -> Parity:
     )
 
 
-def _error(name: str, expected: np.ndarray, found: np.ndarray, kind: str = "other", is_relative: bool = True) -> Error:
+def _error(name: str, expected: jax.Array, found: jax.Array, kind: str = "other", is_relative: bool = True) -> Error:
     difference = np.abs(np.float64(found) - expected)
     if is_relative:
         difference /= 1.0 + np.abs(expected)

@@ -36,6 +36,8 @@ CASES = [
     (["env.reset_noise_scale=-1"], "must be at least 0"),
     (["env.xml_file=nowhere.xml"], "model file not found"),
     (["num_envs=7"], "choose num_envs a multiple of 16"),
+    (["env.name=walker2d"], "env.name=walker2d: choose one of: humanoid"),
+    (["env=walker2d", "env.version=v4", "env.frame_skip=2"], "walker2d v4 does not take frame_skip"),
     (["resume=true"], "resume=true needs run_dir"),
     (["resume=true", "run_dir=/nowhere/at/all"], "no run at '/nowhere/at/all'"),
 ]

@@ -28,7 +28,7 @@ from mjx_walk.wrappers import VectorEnv, VectorState
 class PPOConfig:
     """Settings of PPO; the recipe of each task changes some of them."""
 
-    name: str = "ppo"
+    name: str = setting("ppo", choices=("ppo",))
     unroll_length: int = setting(10, at_least=1)
     """Steps of one trajectory piece, over which advantages are estimated."""
     num_unrolls: int = setting(4, at_least=1)
