@@ -107,13 +107,15 @@ class Progress:
             total=total_steps, initial=done_steps, unit="step", unit_scale=True, disable=not self._is_terminal
         )
         self._last_line = -math.inf
+        self._evaluated: float | None = None
 
     def update(self, row: Row) -> None:
         """Show a row."""
+        self._evaluated = row.get("eval/return", self._evaluated)
         facts = {
             "return": row.get("episode/return"),
             "length": row.get("episode/length"),
-            "eval": row.get("eval/return"),
+            "eval": self._evaluated,
         }
         shown = {name: f"{value:,.0f}" for name, value in facts.items() if value is not None}
         if self._is_terminal:
