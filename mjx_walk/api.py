@@ -150,4 +150,6 @@ def _announce(config: Config, folder: RunFolder) -> None:
             "No accelerator: the CPU-sized recipe, with MuJoCo's C library unless another engine was asked for. "
             "Expect minutes to tens of minutes to a gait; recipes for a GPU reach much higher scores.",
         )
+    if config.physics == "warp":
+        print("Warp compiles its kernels on the first run of a machine, which takes about a minute.")
     sys.stdout.flush()

@@ -49,7 +49,7 @@ class WarpEngine:
             blank = mjx.make_data(
                 self._mj_model,
                 impl="warp",
-                device=jax.local_devices(backend="cpu")[0],
+                device=jax.local_devices()[0],
                 naconmax=CONTACTS_PER_COPY * num_copies + SPARE_CONTACTS,
                 njmax=CONSTRAINTS_PER_COPY,
             )

@@ -85,7 +85,8 @@ class PPOBatch(flax.struct.PyTreeNode):
     """What one `collect` hands to `learn`; N pieces of T steps."""
 
     transitions: Transition
-    """`[N, T, …]`; `next_observation` holds the last step's only, `[N, 1, …]`, which is all that GAE reads."""
+    """`[N, T, …]`. What Brax's loss does not read is left out: `action` is empty (it takes the raw action from
+    `extras`), and `next_observation` holds the last step's only, `[N, 1, …]`."""
     reward_scale: jax.Array
     stats: Metrics
 
@@ -164,7 +165,7 @@ def make_ppo(task: Task, num_envs: int, num_eval_envs: int, config: PPOConfig) -
             value = lost_value(outcome, truncated)
             transition = Transition(
                 observation=step.obs,
-                action=step.action,
+                action=(),
                 reward=returns.bootstrap_truncated(outcome.reward, truncated, value, config.discount, reward_scale),
                 discount=1.0 - jnp.float32(outcome.terminated | truncated),
                 next_observation=(),
@@ -189,7 +190,7 @@ def make_ppo(task: Task, num_envs: int, num_eval_envs: int, config: PPOConfig) -
         return state.replace(env=env_state, return_scale=return_scale, key=key), batch
 
     def learn(state: PPOState, batch: PPOBatch) -> tuple[PPOState, Metrics]:
-        key, update_key = jax.random.split(state.key)
+        key, update_key, entropy_key = jax.random.split(state.key, 3)
         remaining = anneal(state.updates * float(steps_per_update), config.schedule_steps)
         is_adaptive = config.learning_rate_schedule == "adaptive_kl"
         rate_factor = 1.0 if config.learning_rate_schedule == "constant" else remaining
@@ -238,8 +239,12 @@ def make_ppo(task: Task, num_envs: int, num_eval_envs: int, config: PPOConfig) -
             key=key,
             updates=state.updates + 1,
         )
-        learning_rate = {"learning_rate": jnp.float32(rate * rate_factor), "reward_scale": batch.reward_scale}
-        return new_state, batch.stats | _loss_metrics(metrics, config) | learning_rate
+        acted_with = batch.transitions.extras["policy_extras"]["distribution_params"]
+        return new_state, batch.stats | _loss_metrics(metrics) | {
+            "entropy": nets.parametric_action_distribution.entropy(acted_with, entropy_key).mean(),
+            "learning_rate": jnp.float32(rate * rate_factor),
+            "reward_scale": batch.reward_scale,
+        }
 
     return Algorithm(init, collect, learn, policy_params, policy, steps_per_update)
 
@@ -268,7 +273,8 @@ def _adapt_rate(rate: jax.Array, kl: jax.Array, target: float) -> jax.Array:
     return jnp.clip(faster, 1e-5, 1e-2)
 
 
-def _loss_metrics(metrics: Metrics, config: PPOConfig) -> Metrics:
+def _loss_metrics(metrics: Metrics) -> Metrics:
+    """Means over all minibatches, under our names."""
     names = {
         "total_loss": "loss",
         "policy_loss": "policy_loss",
@@ -277,8 +283,4 @@ def _loss_metrics(metrics: Metrics, config: PPOConfig) -> Metrics:
         "policy_dist_mean_std": "policy_std",
         "grad_norm": "grad_norm",
     }
-    means = {new: metrics[old].mean() for old, new in names.items()}
-    entropy_cost = config.entropy_cost
-    if entropy_cost > 0 and config.entropy_schedule == "constant":
-        means["entropy"] = -metrics["entropy_loss"].mean() / entropy_cost
-    return means
+    return {new: metrics[old].mean() for old, new in names.items()}
