@@ -190,7 +190,7 @@ def make_ppo(task: Task, num_envs: int, num_eval_envs: int, config: PPOConfig) -
         return state.replace(env=env_state, return_scale=return_scale, key=key), batch
 
     def learn(state: PPOState, batch: PPOBatch) -> tuple[PPOState, Metrics]:
-        key, update_key, entropy_key = jax.random.split(state.key, 3)
+        key, update_key = jax.random.split(state.key)
         remaining = anneal(state.updates * float(steps_per_update), config.schedule_steps)
         is_adaptive = config.learning_rate_schedule == "adaptive_kl"
         rate_factor = 1.0 if config.learning_rate_schedule == "constant" else remaining
@@ -240,8 +240,9 @@ def make_ppo(task: Task, num_envs: int, num_eval_envs: int, config: PPOConfig) -
             updates=state.updates + 1,
         )
         acted_with = batch.transitions.extras["policy_extras"]["distribution_params"]
+        # The entropy is only told, so it may borrow the next update's key.
         return new_state, batch.stats | _loss_metrics(metrics) | {
-            "entropy": nets.parametric_action_distribution.entropy(acted_with, entropy_key).mean(),
+            "entropy": nets.parametric_action_distribution.entropy(acted_with, key).mean(),
             "learning_rate": jnp.float32(rate * rate_factor),
             "reward_scale": batch.reward_scale,
         }
