@@ -17,7 +17,7 @@ from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.evaluation import Scores, score_in_gymnasium, score_in_sim
 from mjx_walk.loop import Trainer
 from mjx_walk.metrics import Row, read_rows
-from mjx_walk.policies import load_best_policy
+from mjx_walk.policies import deterministic_act, load_best_policy
 from mjx_walk.run_folder import MAY_DIFFER, RunFolder
 
 
@@ -53,8 +53,7 @@ class Run:
 
     @functools.cached_property
     def _act(self) -> Callable:
-        policy = self._algorithm.policy(self.policy_params, deterministic=True)
-        return jax.jit(lambda obs: policy(obs, jax.random.PRNGKey(0)))
+        return deterministic_act(self._algorithm, self.policy_params)
 
     def policy(self, obs: np.ndarray) -> np.ndarray:
         """The deterministic action for one observation or a batch, in Gymnasium's units on both sides.

@@ -19,7 +19,7 @@ from mjx_walk.algos import make_algorithm
 from mjx_walk.api import make_task, resolve
 from mjx_walk.config import Config, compile_cache_dir
 from mjx_walk.envs import TASKS, State, Task
-from mjx_walk.envs.physics import make_engine, resolve_engine
+from mjx_walk.envs.physics import make_engine
 from mjx_walk.evaluation import versions
 from mjx_walk.loop import make_chunk, make_init
 from mjx_walk.peers import brax_ppo_speed
@@ -135,7 +135,7 @@ def _speed_under_random_actions(
 
 def physics_speed(task: Task, num_envs: int, seconds: float) -> float:
     """Environment steps per second of the engine alone, no array derived."""
-    engine = make_engine(resolve_engine(task.engine.name), task.model, task.options.frame_skip, ())
+    engine = make_engine(task.engine.name, task.model, task.options.frame_skip, ())
     step = jax.vmap(lambda state, action: engine.step(state, action)[0])
     return _speed_under_random_actions(task, num_envs, seconds, lambda state: state.physics, step)
 

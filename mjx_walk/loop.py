@@ -17,7 +17,7 @@ from mjx_walk.envs import Task
 from mjx_walk.evaluation import Scores, score_in_gymnasium
 from mjx_walk.interrupt import Interrupt
 from mjx_walk.metrics import MetricsWriter, Progress, Row, name_metrics
-from mjx_walk.policies import load_best_policy, save_best_policy
+from mjx_walk.policies import deterministic_act, load_best_policy, save_best_policy
 from mjx_walk.run_folder import RunFolder
 from mjx_walk.types import Algorithm, Metrics, TrainState
 
@@ -156,8 +156,7 @@ class Trainer:
         print(f"In the real Gymnasium, {scores}", flush=True)
 
     def _score_in_gymnasium(self, policy_params: Any, num_episodes: int) -> Scores:
-        policy = self.algorithm.policy(policy_params, deterministic=True)
-        return score_in_gymnasium(self.task, jax.jit(lambda obs: policy(obs, jax.random.PRNGKey(0))), num_episodes)
+        return score_in_gymnasium(self.task, deterministic_act(self.algorithm, policy_params), num_episodes)
 
     def _start(self) -> tuple[TrainState, int]:
         """The TrainState to begin with, and the number of chunks behind it."""

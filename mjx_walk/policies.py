@@ -1,15 +1,25 @@
 """The best policy of a run, kept apart from the checkpoints: small enough to ship."""
 
+from collections.abc import Callable
 from typing import Any
+
+import jax
 
 from mjx_walk import checkpoint
 from mjx_walk.errors import UserError
 from mjx_walk.run_folder import RunFolder
+from mjx_walk.types import Algorithm
 
 
 def save_best_policy(folder: RunFolder, policy_params: Any, facts: dict[str, Any]) -> None:
     """Replace the run's best policy."""
     checkpoint.save(folder.best_policy, policy_params, facts)
+
+
+def deterministic_act(algorithm: Algorithm, policy_params: Any) -> Callable[[Any], Any]:
+    """The policy without noise, compiled: `obs […, observation_size] → action […, action_size]`, Gymnasium's units."""
+    policy = algorithm.policy(policy_params, deterministic=True)
+    return jax.jit(lambda obs: policy(obs, jax.random.PRNGKey(0)))
 
 
 def load_best_policy(folder: RunFolder, like: Any) -> tuple[Any, dict[str, Any]]:

@@ -20,7 +20,7 @@ def real_env(task, **kwargs):
 def assert_equal_step(task, state, real, action):
     """Step both, from one float32 state, and compare all that Gymnasium returns."""
     obs, reward, terminated, _, info = real.step(action)
-    state = jax.jit(task.step)(state, action) if not hasattr(task, "jitted") else task.jitted(state, action)
+    state = task.jitted(state, action)
     np.testing.assert_array_equal(state.obs, np.float32(obs))
     # Velocities divide the rounding of a position by dt.
     position_rounding = 2 * np.spacing(np.float32(np.abs(real.data.qpos[:2]).max() + 1)) / task.dt
