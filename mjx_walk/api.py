@@ -11,6 +11,7 @@ import numpy as np
 
 from mjx_walk import run_folder
 from mjx_walk.algos import make_algorithm
+from mjx_walk.capacity import check_replay
 from mjx_walk.config import Config, compile_cache_dir, load_config, read_config
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.physics import resolve_engine
@@ -39,9 +40,7 @@ class Run:
         if physics is None and engine == "c" and jax.default_backend() != "cpu":
             engine = "auto"
         self.task = make_task(dataclasses.replace(self.config, physics=engine))
-        self._algorithm = make_algorithm(
-            self.task, self.config.num_envs, self.config.evaluation.num_envs, self.config.algo
-        )
+        self._algorithm = make_algorithm(self.task, self.config.num_envs, self.config.evaluation, self.config.algo)
         state = jax.eval_shape(self._algorithm.init, jax.random.PRNGKey(0))
         like = jax.eval_shape(self._algorithm.policy_params, state)
         self.policy_params, self.policy_facts = load_best_policy(folder, like)
@@ -111,9 +110,12 @@ def train(config: Config, on_metrics: Callable[[Row], None] | None = None) -> tu
     config = dataclasses.replace(config, physics=resolve_engine(config.physics))
     task = make_task(config)
     # Refuses what does not fit before a folder is made.
-    make_algorithm(task, config.num_envs, config.evaluation.num_envs, config.algo)
+    algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
+    replay = check_replay(algorithm, Path(config.run_dir or "."))
     folder, config = run_folder.prepare(config)
     _announce(config, folder)
+    if replay:
+        print(replay, flush=True)
     trainer = Trainer(config, task, folder, on_metrics)
     signal_name = trainer.train()
     if signal_name:

@@ -147,7 +147,7 @@ def step_speed(task: Task, num_envs: int, seconds: float) -> float:
 
 def training_figures(config: Config, task: Task, seconds: float) -> dict[str, float]:
     """Training end to end as the loop runs it, and the compile time of its programs without and with a cache."""
-    algorithm = make_algorithm(task, config.num_envs, config.evaluation.num_envs, config.algo)
+    algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
     old_cache = compile_cache_dir()
     figures = {}
     with tempfile.TemporaryDirectory() as cache:

@@ -5,6 +5,7 @@ import os
 import shutil
 import warnings
 import zlib
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,16 @@ FORMAT = 1
 
 _META = "meta.json"
 _ARRAYS = "arrays"
+_REPLAY = "replay"
+"""The TrainState's field that is kept in the newest checkpoint only, in a part of its own."""
+
+HostArrays = dict[str, np.ndarray]
+"""The leaves of a pytree by their paths, copied to the host."""
+
+
+def to_host(tree: Any) -> HostArrays:
+    """Copy a pytree, so that its own memory may be donated to the next program."""
+    return {name: np.array(leaf) for name, leaf in _named_leaves(jax.device_get(tree)).items()}
 
 
 def save(path: Path, tree: Any, meta: dict[str, Any]) -> None:
@@ -28,7 +39,7 @@ def save(path: Path, tree: Any, meta: dict[str, Any]) -> None:
 
     Args:
         path: folder to make; one that is there is replaced.
-        tree: arrays of any dtype.
+        tree: arrays of any dtype, or what `to_host` made of them.
         meta: JSON-able facts to keep beside it; version and checksums are added.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
@@ -40,8 +51,10 @@ def save(path: Path, tree: Any, meta: dict[str, Any]) -> None:
     unfinished = path.with_name(f".{path.name}.unfinished")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
-    with ocp.PyTreeCheckpointer() as checkpointer:
-        checkpointer.save(unfinished.absolute() / _ARRAYS, arrays)
+    replay = {name: x for name, x in arrays.items() if _is_replay(name)}
+    _write(unfinished / _ARRAYS, {name: x for name, x in arrays.items() if name not in replay})
+    if replay:
+        _write(unfinished / _REPLAY, replay)
     (unfinished / _META).write_text(json.dumps(meta))
     shutil.rmtree(path, ignore_errors=True)
     os.replace(unfinished, path)
@@ -55,7 +68,8 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
         like: a pytree of arrays or `ShapeDtypeStruct`s of the same structure.
 
     Returns:
-        The tree, on the default device, and the facts beside it.
+        The tree, on the default device, and the facts beside it. Where `prune` has taken the replay away, it is
+        empty, with a warning.
 
     Raises:
         UserError: made by an incompatible version, or for a TrainState of another shape.
@@ -68,11 +82,14 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
             f"this is {mjx_walk.__version__} with format {FORMAT}"
         )
     wanted = _named_leaves(like)
-    try:
-        with ocp.PyTreeCheckpointer() as checkpointer:
-            arrays = checkpointer.restore(path.absolute() / _ARRAYS)
-    except Exception as error:  # Orbax reports damage through many types
-        raise ValueError(f"{path} is damaged: {str(error).splitlines()[0][:200]}") from error
+    arrays = _read(path / _ARRAYS)
+    if any(_is_replay(name) for name in meta["crc32"]):
+        if (path / _REPLAY).exists():
+            arrays |= _read(path / _REPLAY)
+        else:
+            warnings.warn(f"{path} has no replay any more; it is filled again before learning goes on", stacklevel=2)
+            arrays |= {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in wanted.items() if _is_replay(name)}
+            meta["crc32"] = {name: crc for name, crc in meta["crc32"].items() if not _is_replay(name)}
     for name, crc in meta["crc32"].items():
         if name not in arrays or _crc32(arrays[name]) != crc:
             raise ValueError(f"{path} is damaged: {name} does not match its checksum")
@@ -123,15 +140,73 @@ def restore_newest(folder: Path, like: Any) -> tuple[Any, dict[str, Any]]:
 
 
 def prune(folder: Path, keep: int) -> None:
-    """Remove all but the newest `keep` checkpoints, and what an interrupted save left."""
+    """Remove all but the newest `keep` checkpoints, the replay of all but the newest, and interrupted saves."""
     for path in list_steps(folder)[:-keep]:
         shutil.rmtree(path)
+    for path in list_steps(folder)[:-1]:
+        shutil.rmtree(path / _REPLAY, ignore_errors=True)
     for path in folder.glob(".*.unfinished"):
         shutil.rmtree(path)
 
 
+class BackgroundSaver:
+    """Writes checkpoints while training goes on, one at a time: training waits only for the copy to the host."""
+
+    def __init__(self, folder: Path, keep: int):
+        """
+        Args:
+            folder: of the checkpoints.
+            keep: newest ones kept.
+        """
+        self._folder = folder
+        self._keep = keep
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
+        self._running: Future[None] | None = None
+
+    def save(self, *parts: tuple[Path, Any, dict[str, Any]]) -> None:
+        """Copy pytrees to the host and begin to write them, in turn; each as the arguments of `checkpoint.save`.
+
+        Waits for those before.
+        """
+        self.wait()
+        copied = [(path, to_host(tree), meta) for path, tree, meta in parts]
+        self._running = self._executor.submit(self._save, copied)
+
+    def wait(self) -> None:
+        """Until nothing is being written.
+
+        Raises:
+            OSError: the disk is full, or what else went wrong in writing.
+        """
+        if self._running:
+            self._running.result()
+            self._running = None
+
+    def _save(self, parts: list[tuple[Path, HostArrays, dict[str, Any]]]) -> None:
+        for path, arrays, meta in parts:
+            save(path, arrays, meta)
+        prune(self._folder, self._keep)
+
+
+def _is_replay(name: str) -> bool:
+    return name.startswith(f"{_REPLAY}.")
+
+
+def _write(path: Path, arrays: HostArrays) -> None:
+    with ocp.PyTreeCheckpointer() as checkpointer:
+        checkpointer.save(path.absolute(), arrays)
+
+
+def _read(path: Path) -> HostArrays:
+    try:
+        with ocp.PyTreeCheckpointer() as checkpointer:
+            return checkpointer.restore(path.absolute())
+    except Exception as error:  # Orbax reports damage through many types
+        raise ValueError(f"{path} is damaged: {str(error).splitlines()[0][:200]}") from error
+
+
 def _crc32(array: np.ndarray) -> int:
-    return zlib.crc32(array.tobytes())
+    return zlib.crc32(np.ascontiguousarray(array).view(np.uint8))
 
 
 def _named_leaves(tree: Any) -> dict[str, Any]:

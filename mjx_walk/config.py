@@ -20,19 +20,10 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.envs.physics import ENGINES
 from mjx_walk.errors import UserError
+from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.settings import setting, validate
 
 CONFIG_DIR = str(Path(__file__).parent / "configs")
-
-
-@dataclasses.dataclass
-class EvaluationConfig:
-    """Deterministic evaluation."""
-
-    num_envs: int = setting(128, at_least=1)
-    """Copies that run whole episodes without noise beside those that learn."""
-    gymnasium_episodes: int = setting(100, at_least=0)
-    """Episodes in the real Gymnasium after training; 0 leaves it out."""
 
 
 @dataclasses.dataclass

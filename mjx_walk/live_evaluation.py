@@ -4,6 +4,7 @@ Run on its own, one evaluation of a thousand steps in turn costs a GPU as much a
 because a step of few copies takes nearly as long as one of many. In the training batch its copies cost their share.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +13,20 @@ import jax
 import jax.numpy as jnp
 
 from mjx_walk.envs import State, Task
+from mjx_walk.settings import setting
 from mjx_walk.types import Metrics, PolicyFn
+
+
+@dataclasses.dataclass
+class EvaluationConfig:
+    """Deterministic evaluation."""
+
+    num_envs: int = setting(128, at_least=1)
+    """Copies that run whole episodes without noise beside those that learn; at most one for each of these."""
+    every_steps: int = setting(0, at_least=0)
+    """Environment steps of training from the start of one round to the next, at least."""
+    gymnasium_episodes: int = setting(100, at_least=0)
+    """Episodes in the real Gymnasium after training; 0 leaves it out."""
 
 
 class LiveEvaluation(flax.struct.PyTreeNode):
@@ -34,18 +48,28 @@ class LiveEvaluation(flax.struct.PyTreeNode):
 
 
 class LiveEvaluator:
-    """Rounds of one episode for each of `num_envs` copies; a new round begins when the slowest copy is done."""
+    """Rounds of one episode for each copy; a new round begins when the slowest copy is done, and not too early."""
 
-    def __init__(self, task: Task, num_envs: int, policy: Callable[[Any], PolicyFn]):
+    def __init__(
+        self,
+        task: Task,
+        num_train_envs: int,
+        config: EvaluationConfig,
+        policy: Callable[[Any], PolicyFn],
+        steps_per_update: int,
+    ):
         """
         Args:
             task: the unbatched environment.
-            num_envs: evaluation copies, E.
+            num_train_envs: copies that learn.
+            config: settings.
             policy: `policy_params → PolicyFn`, deterministic.
+            steps_per_update: environment steps of training between two calls of `next_round`.
         """
         self.task = task
-        self.num_envs = num_envs
+        self.num_envs = min(config.num_envs, num_train_envs)
         self._policy = policy
+        self._min_updates = -(-config.every_steps // steps_per_update)
 
     def init(self, policy_params: Any, starts: State) -> LiveEvaluation:
         """The first round, under the untrained policy.
@@ -94,7 +118,7 @@ class LiveEvaluator:
             The round to go on with; and its scores, NaN where no round has ended: `eval_return`,
             `eval_return_std`, `eval_length`, and `eval_update`, the number of updates behind the scored policy.
         """
-        is_over = ~live.alive.any()
+        is_over = ~live.alive.any() & (update - live.snapshot_update >= self._min_updates)
         score = live.returns.mean()
         is_best = is_over & (score > live.best_return)
         scores = {

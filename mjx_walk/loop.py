@@ -17,7 +17,7 @@ from mjx_walk.envs import Task
 from mjx_walk.evaluation import Scores, score_in_gymnasium
 from mjx_walk.interrupt import Interrupt
 from mjx_walk.metrics import MetricsWriter, Progress, Row, name_metrics
-from mjx_walk.policies import deterministic_act, load_best_policy, save_best_policy
+from mjx_walk.policies import deterministic_act
 from mjx_walk.run_folder import RunFolder
 from mjx_walk.types import Algorithm, Metrics, TrainState
 
@@ -83,15 +83,16 @@ class Trainer:
         self.config = config
         self.task = task
         self.folder = folder
-        self.algorithm = make_algorithm(task, config.num_envs, config.evaluation.num_envs, config.algo)
+        self.algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
         self.steps_per_chunk = self.algorithm.steps_per_update * config.updates_per_chunk
         self.num_chunks = -(-config.total_steps // self.steps_per_chunk)
         self._chunk = make_chunk(self.algorithm, config.updates_per_chunk, fused=task.engine.name != "c")
+        self._saver = checkpoint.BackgroundSaver(folder.checkpoints, config.checkpoint.keep)
         self._on_metrics = on_metrics or (lambda row: None)
         self._started = time.monotonic()
         self._times: collections.deque[tuple[float, int]] = collections.deque()
         self._seconds_before = 0.0
-        self._best_return = -float("inf")
+        self._best_update = -1
         self._has_warned = False
 
     def train(self) -> str | None:
@@ -131,7 +132,12 @@ class Trainer:
         progress.close()
         writer.close()
         plots.plot_run(self.folder.path)
-        self._last_policy = self.algorithm.policy_params(state)
+        self._policies = [(self.algorithm.policy_params(state), {"env_steps": chunk * self.steps_per_chunk})]
+        best = self._best_policy(state)
+        if best:
+            self._policies.append(best)
+        if interrupt.signal_name:
+            self._saver.wait()
         return interrupt.signal_name
 
     def score(self) -> None:
@@ -141,19 +147,16 @@ class Trainer:
         of the two is kept.
         """
         num_episodes = self.config.evaluation.gymnasium_episodes
-        if not num_episodes:
-            return
-        facts = {"env_steps": self.num_chunks * self.steps_per_chunk}
-        scores = self._score_in_gymnasium(self._last_policy, num_episodes)
-        if self._best_return > scores.mean:
-            params, best_facts = load_best_policy(self.folder, self._last_policy)
-            best_scores = self._score_in_gymnasium(params, num_episodes)
-            if best_scores.mean > scores.mean:
-                scores, facts = best_scores, best_facts
-        if facts["env_steps"] == self.num_chunks * self.steps_per_chunk:
-            save_best_policy(self.folder, self._last_policy, facts)
-        scores.save(self.folder.gymnasium_scores, env_steps=facts["env_steps"], wall_seconds=self._seconds())
-        print(f"In the real Gymnasium, {scores}", flush=True)
+        if num_episodes:
+            scored = []
+            for params, facts in self._policies:
+                if not scored or facts["eval_return"] > scored[0][0].mean:
+                    scored.append((self._score_in_gymnasium(params, num_episodes), params, facts))
+            scores, params, facts = max(scored, key=lambda candidate: candidate[0].mean)
+            scores.save(self.folder.gymnasium_scores, env_steps=facts["env_steps"], wall_seconds=self._seconds())
+            print(f"In the real Gymnasium, {scores}", flush=True)
+            self._saver.save((self.folder.best_policy, params, facts))
+        self._saver.wait()
 
     def _score_in_gymnasium(self, policy_params: Any, num_episodes: int) -> Scores:
         return score_in_gymnasium(self.task, deterministic_act(self.algorithm, policy_params), num_episodes)
@@ -166,7 +169,8 @@ class Trainer:
             return init(key), 0
         state, meta = checkpoint.restore_newest(self.folder.checkpoints, jax.eval_shape(init, key))
         self._seconds_before = meta["wall_seconds"]
-        self._best_return = float(state.env.live.best_return)
+        if self._best_policy(state):
+            self._best_update = int(state.env.live.best_update)
         return state, meta["env_steps"] // self.steps_per_chunk
 
     def _row(self, chunk: int, metrics: Metrics) -> Row:
@@ -197,17 +201,23 @@ class Trainer:
         return self._seconds_before + time.monotonic() - self._started
 
     def _save(self, state: TrainState, chunk: int) -> None:
-        """Save the whole state; and the best policy, if it is a new one. Before the first evaluation is over, the
-        best policy is the present one."""
+        """Begin to save the whole state; and the best policy, if it is a new one. Before the first evaluation is over,
+        the best policy is the present one."""
         env_steps = chunk * self.steps_per_chunk
         facts = {"env_steps": env_steps, "wall_seconds": self._seconds()}
-        checkpoint.save(checkpoint.step_path(self.folder.checkpoints, env_steps), state, facts)
-        checkpoint.prune(self.folder.checkpoints, self.config.checkpoint.keep)
+        parts = [(checkpoint.step_path(self.folder.checkpoints, env_steps), state, facts)]
+        best = self._best_policy(state)
+        if not best:
+            parts.append((self.folder.best_policy, self.algorithm.policy_params(state), {"env_steps": env_steps}))
+        elif int(state.env.live.best_update) != self._best_update:
+            self._best_update = int(state.env.live.best_update)
+            parts.append((self.folder.best_policy, *best))
+        self._saver.save(*parts)
+
+    def _best_policy(self, state: TrainState) -> tuple[Any, dict[str, Any]] | None:
+        """The policy that did best in the evaluations beside training, and what is known of it."""
         live = state.env.live
         if math.isinf(live.best_return):
-            save_best_policy(self.folder, self.algorithm.policy_params(state), {"env_steps": env_steps})
-        elif live.best_return > self._best_return:
-            self._best_return = float(live.best_return)
-            env_steps = int(live.best_update) * self.algorithm.steps_per_update
-            best_facts = {"env_steps": env_steps, "eval_return": self._best_return}
-            save_best_policy(self.folder, live.best_policy_params, best_facts)
+            return None
+        env_steps = int(live.best_update) * self.algorithm.steps_per_update
+        return live.best_policy_params, {"env_steps": env_steps, "eval_return": float(live.best_return)}

@@ -51,7 +51,13 @@ def name_metrics(metrics: Metrics, reward_terms: tuple[str, ...], steps_per_upda
         last = {name: float(value[ended[-1]]) for name, value in scores.items()}
         row["eval/env_steps"] = last.pop("update") * steps_per_update
         row |= {f"eval/{name}": value for name, value in last.items()}
-    return row | {f"train/{name}": float(value.mean()) for name, value in values.items()}
+    return row | {f"train/{name}": _mean(value) for name, value in values.items()}
+
+
+def _mean(values: np.ndarray) -> float:
+    """Over the updates that have the metric: off-policy algorithms learn nothing before their replay is filled."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if known.size else math.nan
 
 
 class MetricsWriter:
@@ -76,7 +82,7 @@ class MetricsWriter:
         """Write one row; `env_steps` is its place on the horizontal axis."""
         self._file.write(json.dumps({k: v if math.isfinite(v) else None for k, v in row.items()}) + "\n")
         for name, value in row.items():
-            if "/" in name:
+            if "/" in name and math.isfinite(value):
                 self._events.add_scalar(name, value, int(row["env_steps"]))
 
     def close(self) -> None:

@@ -1,12 +1,16 @@
 """What wraps Brax's networks: the observation normalizer, and actions in Gymnasium's units."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from brax.training import networks as brax_networks
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.agents.sac import networks as sac_networks
+from brax.training.distribution import NormalTanhDistribution
 from brax.training.networks import ACTIVATION
 
 from mjx_walk.envs import Task
@@ -34,15 +38,63 @@ def make_ppo_networks(task: Task, config: Any) -> ppo_networks.PPONetworks:
     return ppo_networks.make_ppo_networks(
         task.observation_size,
         task.action_size,
-        preprocess_observations_fn=functools.partial(
-            running_statistics.normalize, max_abs_value=config.observation_clip
-        ),
+        preprocess_observations_fn=_preprocess(config),
         policy_hidden_layer_sizes=tuple(config.policy_hidden_layer_sizes),
         value_hidden_layer_sizes=tuple(config.value_hidden_layer_sizes),
         activation=ACTIVATION[config.activation],
         distribution_type=config.distribution,
         **normal_only,
     )
+
+
+def make_sac_networks(task: Task, config: Any) -> sac_networks.SACNetworks:
+    """Policy and twin critics of Brax's SAC, for one task, each of its own size.
+
+    Args:
+        task: gives the sizes.
+        config: with `policy_hidden_layer_sizes`, `policy_layer_norm`, the same two for `critic`, `activation` and
+            `observation_clip`.
+    """
+    distribution = NormalTanhDistribution(event_size=task.action_size)
+    return sac_networks.SACNetworks(
+        policy_network=_policy_network(distribution.param_size, task, config),
+        q_network=_critic_network(2, task, config),
+        parametric_action_distribution=distribution,
+    )
+
+
+def make_deterministic_networks(
+    task: Task, config: Any, num_critics: int
+) -> tuple[brax_networks.FeedForwardNetwork, brax_networks.FeedForwardNetwork]:
+    """A policy whose outputs are to be squashed by tanh, and critics; settings as for `make_sac_networks`."""
+    return _policy_network(task.action_size, task, config), _critic_network(num_critics, task, config)
+
+
+def _policy_network(num_outputs: int, task: Task, config: Any) -> brax_networks.FeedForwardNetwork:
+    return brax_networks.make_policy_network(
+        num_outputs,
+        task.observation_size,
+        preprocess_observations_fn=_preprocess(config),
+        hidden_layer_sizes=tuple(config.policy_hidden_layer_sizes),
+        activation=ACTIVATION[config.activation],
+        layer_norm=config.policy_layer_norm,
+    )
+
+
+def _critic_network(num_critics: int, task: Task, config: Any) -> brax_networks.FeedForwardNetwork:
+    return brax_networks.make_q_network(
+        task.observation_size,
+        task.action_size,
+        preprocess_observations_fn=_preprocess(config),
+        hidden_layer_sizes=tuple(config.critic_hidden_layer_sizes),
+        activation=ACTIVATION[config.activation],
+        n_critics=num_critics,
+        layer_norm=config.critic_layer_norm,
+    )
+
+
+def _preprocess(config: Any) -> Callable[..., jax.Array]:
+    return functools.partial(running_statistics.normalize, max_abs_value=config.observation_clip)
 
 
 def init_normalizer(observation_size: int) -> running_statistics.RunningStatisticsState:

@@ -11,11 +11,6 @@ from mjx_walk.run_folder import RunFolder
 from mjx_walk.types import Algorithm
 
 
-def save_best_policy(folder: RunFolder, policy_params: Any, facts: dict[str, Any]) -> None:
-    """Replace the run's best policy."""
-    checkpoint.save(folder.best_policy, policy_params, facts)
-
-
 def deterministic_act(algorithm: Algorithm, policy_params: Any) -> Callable[[Any], Any]:
     """The policy without noise, compiled: `obs […, observation_size] → action […, action_size]`, Gymnasium's units."""
     policy = algorithm.policy(policy_params, deterministic=True)

@@ -25,6 +25,22 @@ def bootstrap_truncated(
     return reward + jnp.where(truncated, discount * next_value / reward_scale, 0.0)
 
 
+def n_step_return(reward: jax.Array, ended: jax.Array, discount: float) -> tuple[jax.Array, jax.Array]:
+    """Discounted rewards up to the end of the episode, or over all n steps.
+
+    Args:
+        reward: `[n, N]`.
+        ended: `[n, N] bool`, whether the episode ended at a step, in whichever way.
+        discount: γ.
+
+    Returns:
+        `Σ γ^i r_i` over the steps that count, `[N] f32`, and their number, `[N] i32`, from 1 to n.
+    """
+    steps = jnp.arange(reward.shape[0])[:, None]
+    still_on = jnp.cumsum(ended, axis=0) - ended == 0
+    return (still_on * discount**steps * reward).sum(axis=0), still_on.sum(axis=0, dtype=jnp.int32)
+
+
 class ReturnScale(flax.struct.PyTreeNode):
     """Running variance of the discounted return, by which rewards may be normalised.
 

@@ -35,3 +35,5 @@ class Algorithm(NamedTuple):
     """`(policy_params, deterministic) → PolicyFn`."""
     steps_per_update: int
     """Environment steps, over all copies, of one `collect`."""
+    replay_bytes: int = 0
+    """Memory of the TrainState's field `replay`, where it has one."""

@@ -20,7 +20,7 @@ def test_every_recipe_fits(recipe):
     config = load_config([f"env={env}", f"algo={algo}", f"hardware={hardware}", "physics=c"])
     assert (config.env.name, config.algo.name, config.hardware) == (env, algo, hardware)
     assert config.algo.schedule_steps == config.total_steps  # annealed to the end, unless it is stopped early
-    algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation.num_envs, config.algo)
+    algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
     assert algorithm.steps_per_update * config.updates_per_chunk < config.total_steps / 20
 
 

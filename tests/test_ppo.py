@@ -13,6 +13,7 @@ from brax.training.agents.ppo import train as brax_ppo
 
 from mjx_walk.algos.ppo import PPOConfig, make_ppo
 from mjx_walk.envs import make_env
+from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.peers import restore_device_put_replicated
 
 SMALL = PPOConfig(
@@ -25,7 +26,7 @@ SMALL = PPOConfig(
 )
 
 
-class _Sizes(Env):
+class Sizes(Env):
     """Tells Brax's trainer the sizes; its transitions come from our own environment."""
 
     observation_size, action_size, backend = 17, 6, "mjx"
@@ -45,7 +46,7 @@ def test_update_equals_brax(monkeypatch):
     """
     config = dataclasses.replace(SMALL, entropy_cost=0.0, observation_clip=None, stagger_episodes=False)
     task = make_env("walker2d", physics="c")
-    algorithm = make_ppo(task, 32, 1, config)
+    algorithm = make_ppo(task, 32, EvaluationConfig(1), config)
     state, batch = jax.jit(algorithm.collect)(jax.jit(algorithm.init)(jax.random.PRNGKey(0)))
     assert batch.transitions.discount.min() >= 0 and batch.stats["episodes"] >= 0
 
@@ -63,7 +64,7 @@ def test_update_equals_brax(monkeypatch):
     monkeypatch.setattr(acting, "generate_unroll", lambda env, state, *args, **kwargs: (state, data))
     restore_device_put_replicated()
     _, theirs, _ = brax_ppo.train(
-        environment=_Sizes(),
+        environment=Sizes(),
         num_timesteps=32 * 8,
         num_evals=1,
         run_evals=False,
@@ -99,7 +100,7 @@ def test_small_batch_training_learns(physics):
     """Sixteen copies of a walker that is paid for standing learn to stand longer, on every engine."""
     task = make_env("walker2d", physics=physics, forward_reward_weight=0.0)
     config = dataclasses.replace(SMALL, unroll_length=32, num_epochs=8, learning_rate=3e-3, discount=0.95)
-    algorithm = make_ppo(task, 16, 2, config)
+    algorithm = make_ppo(task, 16, EvaluationConfig(2), config)
     state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
     collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
     lengths = []
@@ -121,7 +122,7 @@ def test_small_batch_training_learns(physics):
 )
 def test_options_train(changes):
     task = make_env("walker2d", physics="c")
-    algorithm = make_ppo(task, 8, 1, dataclasses.replace(SMALL, num_minibatches=2, **changes))
+    algorithm = make_ppo(task, 8, EvaluationConfig(1), dataclasses.replace(SMALL, num_minibatches=2, **changes))
     state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
     collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
     for _ in range(2):
@@ -140,7 +141,7 @@ def test_linear_schedule_has_its_own_horizon():
     task = make_env("walker2d", physics="c")
     horizon = 8 * 8 * 4  # four updates
     config = dataclasses.replace(SMALL, num_minibatches=2, learning_rate_schedule="linear", schedule_steps=horizon)
-    algorithm = make_ppo(task, 8, 1, config)
+    algorithm = make_ppo(task, 8, EvaluationConfig(1), config)
     state, rates = jax.jit(algorithm.init)(jax.random.PRNGKey(0)), []
     collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
     for _ in range(5):
@@ -153,7 +154,7 @@ def test_learning_uses_the_terminal_value_only_where_truncated():
     """A batch in which every episode is cut off pays the lost value; one that terminates does not."""
     task = make_env("humanoid_standup", physics="c", max_episode_steps=4)
     config = dataclasses.replace(SMALL, num_minibatches=2, stagger_episodes=False, reward_scale=0.01)
-    algorithm = make_ppo(task, 4, 1, config)
+    algorithm = make_ppo(task, 4, EvaluationConfig(1), config)
     state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
     _, batch = jax.jit(algorithm.collect)(state)
     ended = batch.transitions.discount == 0

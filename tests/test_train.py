@@ -122,7 +122,7 @@ def test_nothing_is_compiled_twice():
         return step(state, action)
 
     task.step = counted
-    algorithm = make_algorithm(task, config.num_envs, config.evaluation.num_envs, config.algo)
+    algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
     chunk = make_chunk(algorithm, 2, fused=True)
     state = make_init(algorithm)(jax.random.PRNGKey(0))
     state, _ = chunk(state)

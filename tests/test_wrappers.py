@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_walk.envs import make_env
-from mjx_walk.live_evaluation import LiveEvaluator
+from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
 from mjx_walk.wrappers import VectorEnv
 
 
@@ -16,7 +16,8 @@ def still(task):
 
 
 def make_vector(task, num_envs, num_eval_envs=2, **kwargs):
-    return VectorEnv(task, num_envs, LiveEvaluator(task, num_eval_envs, still(task)), **kwargs)
+    evaluator = LiveEvaluator(task, num_envs, EvaluationConfig(num_eval_envs), still(task), steps_per_update=num_envs)
+    return VectorEnv(task, num_envs, evaluator, **kwargs)
 
 
 @pytest.fixture(scope="module")

@@ -2,15 +2,24 @@
 
 from typing import Any
 
+from mjx_walk.algos.ddpg import DDPGConfig, make_ddpg
 from mjx_walk.algos.ppo import PPOConfig, make_ppo
+from mjx_walk.algos.sac import SACConfig, make_sac
+from mjx_walk.algos.td3 import TD3Config, make_td3
 from mjx_walk.envs import Task
+from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.types import Algorithm
 
-ALGORITHMS: dict[str, tuple[Any, type]] = {"ppo": (make_ppo, PPOConfig)}
+ALGORITHMS: dict[str, tuple[Any, type]] = {
+    "ppo": (make_ppo, PPOConfig),
+    "sac": (make_sac, SACConfig),
+    "td3": (make_td3, TD3Config),
+    "ddpg": (make_ddpg, DDPGConfig),
+}
 
 __all__ = ["ALGORITHMS", "make_algorithm"]
 
 
-def make_algorithm(task: Task, num_envs: int, num_eval_envs: int, config: Any) -> Algorithm:
-    """Build the algorithm that the settings are of, with at most one evaluation copy for each that learns."""
-    return ALGORITHMS[config.name][0](task, num_envs, min(num_eval_envs, num_envs), config)
+def make_algorithm(task: Task, num_envs: int, evaluation: EvaluationConfig, config: Any) -> Algorithm:
+    """Build the algorithm that the settings are of."""
+    return ALGORITHMS[config.name][0](task, num_envs, evaluation, config)

@@ -17,7 +17,8 @@ from brax.training.networks import ACTIVATION
 from mjx_walk import networks, returns, rollout
 from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
-from mjx_walk.live_evaluation import LiveEvaluator
+from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
+from mjx_walk.optimizers import descend, make_adam
 from mjx_walk.schedules import anneal
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics, Transition
@@ -91,13 +92,13 @@ class PPOBatch(flax.struct.PyTreeNode):
     stats: Metrics
 
 
-def make_ppo(task: Task, num_envs: int, num_eval_envs: int, config: PPOConfig) -> Algorithm:
+def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PPOConfig) -> Algorithm:
     """Build PPO for a task.
 
     Args:
         task: the unbatched environment.
         num_envs: copies that learn.
-        num_eval_envs: copies that are evaluated beside them.
+        evaluation: of the policy beside them.
         config: settings.
 
     Raises:
@@ -118,9 +119,10 @@ def make_ppo(task: Task, num_envs: int, num_eval_envs: int, config: PPOConfig) -
     def policy_params(state: PPOState) -> Any:
         return (state.normalizer, state.params.policy)
 
-    env = VectorEnv(task, num_envs, LiveEvaluator(task, num_eval_envs, policy), config.stagger_episodes)
-    optimizer = _make_optimizer(config)
     steps_per_update = num_envs * config.unroll_length * config.num_unrolls
+    evaluator = LiveEvaluator(task, num_envs, evaluation, policy, steps_per_update)
+    env = VectorEnv(task, num_envs, evaluator, config.stagger_episodes)
+    optimizer = _make_optimizer(config)
 
     def init(key: jax.Array) -> PPOState:
         policy_key, value_key, env_key, key = jax.random.split(key, 4)
@@ -216,10 +218,9 @@ def make_ppo(task: Task, num_envs: int, num_eval_envs: int, config: PPOConfig) -
             grads, metrics = jax.grad(loss_fn, has_aux=True)(params, normalizer, data, loss_key)
             if is_adaptive:
                 rate = _adapt_rate(rate, metrics["kl_mean"], config.target_kl)
-            updates, opt_state = optimizer.update(grads, opt_state)
-            updates = jax.tree.map(lambda u: -rate * rate_factor * u, updates)
             metrics["grad_norm"] = optax.global_norm(grads)
-            return (optax.apply_updates(params, updates), opt_state, rate, key), metrics
+            params, opt_state = descend(optimizer, params, grads, opt_state, rate * rate_factor)
+            return (params, opt_state, rate, key), metrics
 
         def epoch(carry, _):
             params, opt_state, rate, key = carry
@@ -257,13 +258,9 @@ def _pieces_first(x: jax.Array) -> jax.Array:
 
 
 def _make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    """Clip and Adam, without the learning rate, which `learn` multiplies in."""
     if config.max_value_grad_norm is None:
-        return optax.chain(optax.clip_by_global_norm(config.max_policy_grad_norm), optax.scale_by_adam())
-    parts = {
-        "policy": optax.chain(optax.clip_by_global_norm(config.max_policy_grad_norm), optax.scale_by_adam()),
-        "value": optax.chain(optax.clip_by_global_norm(config.max_value_grad_norm), optax.scale_by_adam()),
-    }
+        return make_adam(config.max_policy_grad_norm)
+    parts = {"policy": make_adam(config.max_policy_grad_norm), "value": make_adam(config.max_value_grad_norm)}
     return optax.partition(parts, ppo_losses.PPONetworkParams(policy="policy", value="value"))
 
 

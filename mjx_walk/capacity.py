@@ -1,0 +1,54 @@
+"""Whether a run fits the memory and the disk, said before anything is allocated."""
+
+import os
+import shutil
+from pathlib import Path
+
+import jax
+
+from mjx_walk.errors import UserError
+from mjx_walk.types import Algorithm
+
+_USABLE = 0.9
+"""Share of the device's memory that a replay may take."""
+
+
+def check_replay(algorithm: Algorithm, run_dir: Path) -> str | None:
+    """Say what a replay takes of memory and disk.
+
+    Args:
+        algorithm: what is to run.
+        run_dir: where it is to be saved; it need not exist.
+
+    Returns:
+        One line, or None where there is no replay.
+
+    Raises:
+        UserError: it does not fit.
+    """
+    if not algorithm.replay_bytes:
+        return None
+    shapes = jax.tree.leaves(jax.eval_shape(algorithm.init, jax.random.PRNGKey(0)))
+    checkpoint_bytes = sum(x.size * x.dtype.itemsize for x in shapes)
+    replay, disk = f"{algorithm.replay_bytes / 1e9:,.2f} GB", f"{2 * checkpoint_bytes / 1e9:,.2f} GB"
+    memory = device_memory()
+    if algorithm.replay_bytes > _USABLE * memory:
+        raise UserError(
+            f"the replay needs {replay}, but the device has {memory / 1e9:,.2f} GB; lower algo.replay_capacity"
+        )
+    existing = next(path for path in (run_dir.absolute(), *run_dir.absolute().parents) if path.exists())
+    free = shutil.disk_usage(existing).free
+    if 2 * checkpoint_bytes > free:
+        raise UserError(
+            f"checkpoints with their replay need {disk} of disk, but {existing} has {free / 1e9:,.2f} GB left; lower "
+            "algo.replay_capacity or choose another run_dir"
+        )
+    return f"Replay: {replay} of device memory, and while a checkpoint replaces the one before up to {disk} of disk."
+
+
+def device_memory() -> int:
+    """Bytes that JAX may allocate on its first device."""
+    stats = jax.devices()[0].memory_stats()
+    if stats and "bytes_limit" in stats:
+        return stats["bytes_limit"]
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -1,0 +1,26 @@
+"""Adam with a learning rate that the learner hands in at every step."""
+
+from typing import Any
+
+import jax
+import optax
+
+
+def make_adam(max_grad_norm: float | None = None) -> optax.GradientTransformation:
+    """Adam without its learning rate, which `descend` multiplies in, after clipping by the global norm if asked."""
+    if max_grad_norm is None:
+        return optax.scale_by_adam()
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.scale_by_adam())
+
+
+def descend(
+    optimizer: optax.GradientTransformation, params: Any, grads: Any, state: optax.OptState, rate: jax.Array | float
+) -> tuple[Any, optax.OptState]:
+    """One step down the gradient: `(params, optimizer state)` after it."""
+    updates, state = optimizer.update(grads, state)
+    return optax.apply_updates(params, jax.tree.map(lambda u: -rate * u, updates)), state
+
+
+def move_towards(target: Any, params: Any, tau: float) -> Any:
+    """Polyak averaging: `(1 − τ) target + τ params`."""
+    return jax.tree.map(lambda t, p: (1.0 - tau) * t + tau * p, target, params)

@@ -1,0 +1,136 @@
+"""Every algorithm on tasks whose answer is known: values, then actions, then both."""
+
+import functools
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy_tasks
+
+from mjx_walk import networks
+from mjx_walk.algos import ALGORITHMS
+from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.loop import make_chunk, make_init
+
+DISCOUNT = 0.5
+SMALL = {"policy_hidden_layer_sizes": (32, 32), "discount": DISCOUNT, "reward_scale": 1.0}
+OFF_POLICY = SMALL | {
+    "critic_hidden_layer_sizes": (32, 32),
+    "batch_size": 64,
+    "unroll_length": 1,
+    "updates_per_step": 4,
+    "replay_capacity": 4096,
+    "prefill_steps": 128,
+    "tau": 0.05,
+    "policy_learning_rate": 1e-3,
+    "critic_learning_rate": 3e-3,
+}
+DETERMINISTIC = OFF_POLICY | {"min_exploration_noise": 0.1, "max_exploration_noise": 0.8}
+SETTINGS = {
+    "ppo": SMALL
+    | {
+        "value_hidden_layer_sizes": (32, 32),
+        "unroll_length": 4,
+        "num_unrolls": 2,
+        "num_minibatches": 4,
+        "learning_rate": 3e-3,
+        # With normalised advantages a noiseless task never stops to shrink the policy's std.
+        "normalize_advantages": False,
+        "entropy_cost": 1e-3,
+    },
+    "sac": OFF_POLICY | {"init_alpha": 1e-3, "alpha_learning_rate": 1e-6},
+    "td3": DETERMINISTIC,
+    "ddpg": DETERMINISTIC,
+}
+UPDATES = {"ppo": 60, "sac": 400, "td3": 400, "ddpg": 400}
+
+
+def values(name, task, config, state, obs):
+    """What the algorithm believes the observations, `[N, 1]`, to be worth under its policy."""
+    if name == "ppo":
+        nets = networks.make_ppo_networks(task, config)
+        return nets.value_network.apply(state.normalizer, state.params.value, obs)
+    action = ALGORITHMS[name][0](task, 8, EvaluationConfig(1), config).policy(
+        (state.normalizer, state.learner.policy), deterministic=True
+    )(obs, jax.random.PRNGKey(0))
+    critics = networks.make_deterministic_networks(task, config, 1 if name == "ddpg" else 2)[1]
+    return critics.apply(state.normalizer, state.learner.critic, obs, action).min(axis=-1)
+
+
+@functools.cache
+def trained(name, task_class, max_episode_steps=10):
+    """Value and action at a few observations after training."""
+    task = task_class(max_episode_steps)
+    make, config_class = ALGORITHMS[name]
+    config = config_class(**SETTINGS[name])
+    algorithm = make(task, 32, EvaluationConfig(1), config)
+    state = make_init(algorithm)(jax.random.PRNGKey(0))
+    state, metrics = make_chunk(algorithm, UPDATES[name], fused=True)(state)
+    obs = jnp.float32([[-1.0], [0.0], [1.0]])
+    action = algorithm.policy(algorithm.policy_params(state), deterministic=True)(obs, jax.random.PRNGKey(0))
+    assert np.isfinite(metrics["episodes"]).all()
+    return np.asarray(values(name, task, config, state, obs)), np.asarray(action)[:, 0]
+
+
+algorithms = pytest.mark.parametrize("name", list(SETTINGS))
+
+
+@algorithms
+def test_constant_reward(name):
+    assert trained(name, toy_tasks.ConstantReward)[0][1] == pytest.approx(1.0, abs=0.05)
+
+
+@algorithms
+def test_reward_seen_in_the_observation(name):
+    value = trained(name, toy_tasks.ObservedReward)[0]
+    assert value[[0, 2]] == pytest.approx([-1.0, 1.0], abs=0.1)
+
+
+@algorithms
+def test_discounting(name):
+    value = trained(name, toy_tasks.DelayedReward)[0]
+    assert value[[1, 2]] == pytest.approx([DISCOUNT, 1.0], abs=0.05)
+
+
+@algorithms
+def test_a_time_limit_does_not_end_the_future(name):
+    value = trained(name, toy_tasks.EndlessReward, 3)[0]
+    assert value[1] == pytest.approx(1.0 / (1.0 - DISCOUNT), abs=0.1)
+
+
+@algorithms
+def test_reward_for_an_action(name):
+    assert trained(name, toy_tasks.RewardedAction)[1][1] == pytest.approx(0.5, abs=0.1)
+
+
+@algorithms
+def test_reward_for_an_action_that_suits_the_observation(name):
+    value, action = trained(name, toy_tasks.RewardedObservedAction)
+    assert action[[0, 2]] == pytest.approx([-0.5, 0.5], abs=0.15)
+    assert value[[0, 2]] == pytest.approx([0.0, 0.0], abs=0.1 if name != "ppo" else 0.5)
+
+
+def test_mountain_car_equals_gymnasiums():
+    task = toy_tasks.MountainCar()
+    env = gymnasium.make("MountainCarContinuous-v0")
+    step = jax.jit(task.step)
+    ends = 0
+    for seed, push in ((0, 1.0), (1, 0.4), (2, 0.0)):
+        obs, _ = env.reset(seed=seed)
+        state = task._state(jnp.float32(obs[:1]), jnp.float32(obs[1:]), 0.0, False, jnp.int32(0))
+        rng = np.random.default_rng(seed)
+        for _ in range(999):
+            action = np.float32([push * np.sign(obs[1] + 1e-9) + (1 - push) * rng.uniform(-1.5, 1.5)])
+            state = step(state, action)
+            obs, reward, terminated, truncated, _ = env.step(action)
+            np.testing.assert_allclose(state.obs, obs, atol=2e-5)
+            assert float(state.reward) == pytest.approx(reward, abs=1e-4)
+            assert (bool(state.terminated), bool(state.truncated)) == (terminated, truncated)
+            if terminated or truncated:
+                ends += terminated
+                break
+            # Teacher-forced: rounding would otherwise add up over a thousand steps.
+            state = state.replace(physics=state.physics._replace(qpos=jnp.float32(obs[:1]), qvel=jnp.float32(obs[1:])))
+    assert ends >= 1

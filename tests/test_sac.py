@@ -1,0 +1,124 @@
+"""SAC: its update equals Brax's."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.training import acting
+from brax.training.agents.sac import networks as brax_networks
+from brax.training.agents.sac import train as brax_sac
+from test_ppo import Sizes
+
+from mjx_walk.algos.sac import SACConfig, make_sac
+from mjx_walk.envs import make_env
+from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.peers import restore_device_put_replicated
+from mjx_walk.replay import ReplayBuffer
+
+NUM_ENVS, BATCH, UPDATES = 16, 32, 5
+
+
+def test_update_equals_brax(monkeypatch):
+    """Brax's own trainer, given our networks, our steps and our samples, ends at our parameters after five updates.
+
+    Noise is a fixed function of the shape, since the two draw their keys in another order.
+    """
+    config = SACConfig(
+        unroll_length=1,
+        updates_per_step=UPDATES,
+        batch_size=BATCH,
+        replay_capacity=256,
+        prefill_steps=0,
+        policy_learning_rate=1e-3,
+        critic_learning_rate=1e-3,
+        reward_scale=2.0,
+        observation_clip=None,
+        policy_hidden_layer_sizes=(32, 32),
+        critic_hidden_layer_sizes=(32, 32),
+    )
+    task = make_env("walker2d", physics="c")
+    algorithm = make_sac(task, NUM_ENVS, EvaluationConfig(1), config)
+    state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
+    collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
+    for _ in range(4):
+        state, _ = learn(*collect(state))
+    state, (steps, stats) = collect(state)
+    buffer = ReplayBuffer(task, NUM_ENVS, 16)
+    batch = buffer.sample(state.replay, jax.random.PRNGKey(7), BATCH, 1, config.discount)
+    assert set(np.asarray(batch.discount)) <= {0.0, 1.0}
+
+    monkeypatch.setattr(ReplayBuffer, "sample", lambda *_: batch)
+    monkeypatch.setattr(jax.random, "normal", lambda key, shape: jnp.sin(jnp.arange(np.prod(shape)).reshape(shape)))
+    # A new function: the one above is traced already, without the patches.
+    ours, metrics = jax.jit(lambda *args: algorithm.learn(*args))(state, (steps, stats))
+    assert int(ours.critic_updates - state.critic_updates) == UPDATES
+
+    begin = brax_sac._init_training_state
+
+    def begin_with_ours(**kwargs):
+        learner = state.learner
+        theirs = begin(**kwargs)
+        replaced = {
+            "policy_params": learner.policy,
+            "q_params": learner.critic,
+            "target_q_params": learner.target_critic,
+            "alpha_params": learner.log_alpha,
+            "normalizer_params": state.normalizer,
+        }
+        theirs = theirs.replace(**jax.tree.map(lambda x: x[None], replaced))
+        return theirs.replace(
+            policy_optimizer_state=_adam(theirs.policy_optimizer_state, learner.policy_optimizer),
+            q_optimizer_state=_adam(theirs.q_optimizer_state, learner.critic_optimizer),
+            alpha_optimizer_state=_adam(theirs.alpha_optimizer_state, learner.alpha_optimizer),
+        )
+
+    stored = batch._replace(
+        observation=steps.observation[0],
+        action=steps.action[0],
+        reward=steps.reward[0],
+        discount=jnp.ones(NUM_ENVS),
+        next_observation=steps.next_observation[0],
+        extras={"state_extras": {"truncation": jnp.zeros(NUM_ENVS)}, "policy_extras": {}},
+    )
+    drawn = batch._replace(extras=batch.extras | {"policy_extras": {}})
+    tiled = jax.tree.map(lambda x: jnp.tile(x, (UPDATES,) + (1,) * (x.ndim - 1)), drawn)
+    found = {}
+    monkeypatch.setattr(brax_sac, "_init_training_state", begin_with_ours)
+    monkeypatch.setattr(acting, "actor_step", lambda env, env_state, *args, **kwargs: (env_state, stored))
+    queue = brax_sac.replay_buffers.UniformSamplingQueue
+    monkeypatch.setattr(queue, "sample", lambda self, buffer_state: (buffer_state, tiled))
+    monkeypatch.setattr(brax_sac.pmap, "assert_is_replicated", lambda state: found.update(state=state))
+    monkeypatch.setattr(acting.Evaluator, "run_evaluation", lambda *args, **kwargs: {})
+    restore_device_put_replicated()
+    brax_sac.train(
+        environment=Sizes(),
+        num_timesteps=NUM_ENVS,
+        episode_length=1,
+        num_envs=NUM_ENVS,
+        num_eval_envs=1,
+        learning_rate=1e-3,
+        discounting=config.discount,
+        batch_size=BATCH,
+        normalize_observations=True,
+        reward_scaling=config.reward_scale,
+        tau=config.tau,
+        max_replay_size=256,
+        grad_updates_per_step=UPDATES,
+        network_factory=lambda *args, **kwargs: brax_networks.make_sac_networks(
+            *args, hidden_layer_sizes=(32, 32), **kwargs
+        ),
+    )
+    theirs = jax.tree.map(lambda x: x[0], found["state"])
+    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), ours.learner.critic, state.learner.critic)
+    assert max(jax.tree.leaves(moved)) > 1e-3
+    expected = (theirs.policy_params, theirs.q_params, theirs.target_q_params, theirs.alpha_params)
+    learner = ours.learner
+    result = (learner.policy, learner.critic, learner.target_critic, learner.log_alpha)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6), result, expected)
+    np.testing.assert_allclose(ours.normalizer.mean, theirs.normalizer_params.mean, rtol=1e-5, atol=1e-6)
+    assert metrics["alpha"] == pytest.approx(float(jnp.exp(theirs.alpha_params)), rel=1e-2)
+
+
+def _adam(theirs, ours):
+    """Our Adam's state in the place of theirs, which also has the learning rate's, empty, state."""
+    return (jax.tree.map(lambda x: x[None], ours), *theirs[1:])
