@@ -38,6 +38,8 @@ class OffPolicyConfig:
     """Of the observations stored."""
     prefill_steps: int = setting(10_000, at_least=0)
     """Environment steps under uniformly random actions, before learning begins."""
+    noise_repeat: int = setting(1, at_least=1)
+    """Steps that the same draw of exploration noise is kept for."""
     n_step: int = setting(1, at_least=1)
     discount: float = setting(0.99, at_least=0, at_most=1)
     tau: float = setting(0.005, above=0, at_most=1)
@@ -101,6 +103,8 @@ class OffPolicyState(flax.struct.PyTreeNode):
     return_scale: returns.ReturnScale
     replay: Replay
     env: VectorState
+    noise_key: jax.Array
+    """From which the exploration noise of every step follows."""
     key: jax.Array
     updates: jax.Array
     """`[] i32`: unrolls done."""
@@ -146,7 +150,7 @@ def make_off_policy(
     env = VectorEnv(task, num_envs, evaluator, config.stagger_episodes)
 
     def init(key: jax.Array) -> OffPolicyState:
-        learner_key, env_key, key = jax.random.split(key, 3)
+        learner_key, env_key, noise_key, key = jax.random.split(key, 4)
         learner_state = learner.init(learner_key)
         normalizer = networks.init_normalizer(task.observation_size)
         return OffPolicyState(
@@ -156,12 +160,15 @@ def make_off_policy(
             return_scale=returns.init_return_scale(num_envs),
             replay=buffer.init(),
             env=env.init(env_key, (normalizer, learner.policy_params(learner_state))),
+            noise_key=noise_key,
             key=key,
             updates=jnp.zeros((), jnp.int32),
         )
 
     def collect(state: OffPolicyState) -> tuple[OffPolicyState, tuple[Steps, Metrics]]:
-        key, pool_key, run_key = jax.random.split(state.key, 3)
+        key, pool_key = jax.random.split(state.key)
+        step = state.updates * config.unroll_length + jnp.arange(config.unroll_length)
+        noise_keys = jax.vmap(jax.random.fold_in, (None, 0))(state.noise_key, step // config.noise_repeat)
         is_random = state.updates * float(steps_per_update) < config.prefill_steps
         params = policy_params(state)
 
@@ -177,7 +184,7 @@ def make_off_policy(
             return Steps(step.obs, step.extras, outcome.reward, outcome.terminated, outcome.truncated, outcome.obs)
 
         env_state, scores = env.renew(state.env, pool_key, params, state.updates)
-        env_state, steps, stats = rollout.unroll(env, env_state, actor, run_key, config.unroll_length, keep)
+        env_state, steps, stats = rollout.unroll(env, env_state, actor, noise_keys, keep)
         return state.replace(env=env_state, key=key), (steps, stats | scores)
 
     def learn(state: OffPolicyState, collected: tuple[Steps, Metrics]) -> tuple[OffPolicyState, Metrics]:

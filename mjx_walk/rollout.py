@@ -27,18 +27,16 @@ def unroll(
     env: VectorEnv,
     state: VectorState,
     actor: Actor,
-    key: jax.Array,
-    num_steps: int,
+    keys: jax.Array,
     keep: Callable[[Step], Any],
 ) -> tuple[VectorState, Any, Metrics]:
-    """Step all copies `num_steps` times.
+    """Step all copies T times.
 
     Args:
         env: the copies.
         state: where they are.
         actor: chooses actions.
-        key: random key.
-        num_steps: T.
+        keys: `[T]` random keys, for the actor.
         keep: what of each step to store; whatever it drops takes no memory.
 
     Returns:
@@ -51,7 +49,7 @@ def unroll(
         state, outcome, stats = env.step(state, action)
         return state, (keep(Step(obs, action, outcome, extras)), stats)
 
-    state, (kept, stats) = jax.lax.scan(one, state, jax.random.split(key, num_steps))
+    state, (kept, stats) = jax.lax.scan(one, state, keys)
     return state, kept, jax.tree.map(lambda x: x.sum(0), stats)
 
 

@@ -15,8 +15,24 @@ TINY = (
     "algo.num_epochs=2",
     "checkpoint.every_chunks=2",
 )
+TINY_OFF_POLICY = (
+    "env=walker2d",
+    "env.max_episode_steps=30",
+    "num_envs=8",
+    "updates_per_chunk=8",
+    "evaluation.num_envs=2",
+    "evaluation.gymnasium_episodes=0",
+    "algo.unroll_length=1",
+    "algo.updates_per_step=2",
+    "algo.batch_size=16",
+    "algo.replay_capacity=256",
+    "algo.prefill_steps=64",
+    "algo.policy_hidden_layer_sizes=[32,32]",
+    "algo.critic_hidden_layer_sizes=[32,32]",
+    "checkpoint.every_chunks=2",
+)
 TINY_CHUNK = 8 * 8
-"""Environment steps of a chunk of it."""
+"""Environment steps of a chunk of either."""
 
 
 def command(module: str, *arguments: str, **kwargs) -> subprocess.CompletedProcess:

@@ -14,7 +14,7 @@ from mjx_walk.errors import UserError
 
 CASES = [
     (["env=ant"], "unknown env 'ant'; choose one of: humanoid, humanoid_standup, walker2d"),
-    (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo"),
+    (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo, sac, td3, ddpg"),
     (["physics=bullet"], "physics=bullet: choose one of: auto, warp, jax, c"),
     (["env.version=v3"], "env.version=v3: choose one of: v5, v4"),
     (["recipe=nope"], "recipes: cpu/humanoid_ppo"),
@@ -35,6 +35,10 @@ CASES = [
     (["env.frame_skip=0"], "env.frame_skip=0: must be at least 1"),
     (["env.reset_noise_scale=-1"], "must be at least 0"),
     (["env.xml_file=nowhere.xml"], "model file not found"),
+    (["algo=sac", "algo.replay_capacity=10_000_000_000"], "lower algo.replay_capacity"),
+    (["algo=sac", "algo.replay_capacity=1000"], "algo.prefill_steps=10000 is more than algo.replay_capacity=1000"),
+    (["algo=td3", "algo.policy_delay=3"], "does not divide into algo.policy_delay=3"),
+    (["algo=sac", "algo.tau=0"], "algo.tau=0.0: must be above 0"),
     (["num_envs=7"], "choose num_envs a multiple of 16"),
     (["env.name=walker2d"], "env.name=walker2d: choose one of: humanoid"),
     (["env=walker2d", "env.version=v4", "env.frame_skip=2"], "walker2d v4 does not take frame_skip"),

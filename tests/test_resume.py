@@ -10,7 +10,7 @@ import time
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
-from commands import TINY, TINY_CHUNK, command
+from commands import TINY, TINY_CHUNK, TINY_OFF_POLICY, command
 from test_checkpoint import flip_a_byte
 
 from mjx_walk import checkpoint
@@ -19,11 +19,13 @@ from mjx_walk.api import resolve
 
 def leaves(run_dir, chunk):
     with ocp.PyTreeCheckpointer() as checkpointer:
-        return checkpointer.restore(checkpoint.step_path(run_dir / "checkpoints", chunk * TINY_CHUNK) / "arrays")
+        path = checkpoint.step_path(run_dir / "checkpoints", chunk * TINY_CHUNK)
+        parts = [checkpointer.restore(part) for part in (path / "arrays", path / "replay") if part.exists()]
+    return {name: leaf for part in parts for name, leaf in part.items()}
 
 
-def train(run_dir, *arguments):
-    done = command("train", *TINY, f"run_dir={run_dir}", *arguments)
+def train(run_dir, *arguments, tiny=TINY):
+    done = command("train", *tiny, f"run_dir={run_dir}", *arguments)
     assert done.returncode == 0, done.stderr
     return done
 
@@ -47,6 +49,33 @@ def test_n_and_n_chunks_equal_2n(tmp_path, physics):
     assert [row["env_steps"] for row in rows] == [i * TINY_CHUNK for i in range(1, 7)]
     seconds = [row["wall_seconds"] for row in rows]
     assert seconds == sorted(seconds)
+
+
+@pytest.mark.parametrize("algo", ["sac", "td3", "ddpg"])
+def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
+    """The first half ends after the replay has gone round, with truncated episodes in it."""
+    train(tmp_path / "whole", f"algo={algo}", f"total_steps={9 * TINY_CHUNK}", tiny=TINY_OFF_POLICY)
+    train(tmp_path / "halves", f"algo={algo}", f"total_steps={5 * TINY_CHUNK}", tiny=TINY_OFF_POLICY)
+    train(tmp_path / "halves", f"algo={algo}", f"total_steps={9 * TINY_CHUNK}", "resume=true", tiny=TINY_OFF_POLICY)
+    whole, halves = leaves(tmp_path / "whole", 9), leaves(tmp_path / "halves", 9)
+    assert whole.keys() == halves.keys() and whole["replay.rows"] == 72 and whole["replay.cuts"].sum() > 0
+    for name, leaf in whole.items():
+        np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
+    steps = checkpoint.list_steps(tmp_path / "whole" / "checkpoints")
+    assert [(path / "replay").exists() for path in steps] == [False, False, True]
+    assert not (tmp_path / "whole" / "checkpoints" / "best" / "replay").exists()
+
+
+def test_a_replay_that_is_gone_is_filled_again(tmp_path):
+    train(tmp_path / "run", "algo=sac", f"total_steps={6 * TINY_CHUNK}", tiny=TINY_OFF_POLICY)
+    flip_a_byte(checkpoint.step_path(tmp_path / "run" / "checkpoints", 6 * TINY_CHUNK))
+    before = leaves(tmp_path / "run", 4)
+    done = train(tmp_path / "run", "algo=sac", f"total_steps={6 * TINY_CHUNK}", "resume=true", tiny=TINY_OFF_POLICY)
+    assert "has no replay any more; it is filled again" in done.stderr
+    after = leaves(tmp_path / "run", 6)
+    assert after["replay.rows"] == 16 and after["updates"] == 48
+    # Two chunks of eight updates, the first seven of which wait for 64 transitions.
+    assert after["critic_updates"] - before["critic_updates"] == 2 * (16 - 7)
 
 
 def test_a_damaged_checkpoint_costs_only_its_own_chunks(tmp_path):

@@ -87,6 +87,16 @@ def test_staggered_first_episodes_are_not_counted(walker):
     assert bool(state.is_whole.all())
 
 
+def test_a_round_of_evaluation_is_not_begun_too_early(walker):
+    config = EvaluationConfig(2, every_steps=100)
+    env = VectorEnv(walker, 4, LiveEvaluator(walker, 4, config, still(walker), steps_per_update=8))
+    state = env.init(jax.random.PRNGKey(0), ())
+    state = state.replace(live=state.live.replace(alive=jnp.zeros(2, bool)))
+    for update, is_told in ((11, False), (12, False), (13, True)):
+        _, scores = env.renew(state, jax.random.PRNGKey(1), (), jnp.int32(update))
+        assert np.isfinite(scores["eval_return"]) == is_told
+
+
 def test_live_evaluation_equals_an_evaluation_on_its_own(walker):
     """Deterministic episodes in the training batch return what the same episodes return alone."""
     env = make_vector(walker, 3, num_eval_envs=2)

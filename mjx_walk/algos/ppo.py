@@ -176,7 +176,8 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
             return transition, outcome.reward, outcome.terminated | truncated
 
         def piece(env_state, key):
-            env_state, kept, stats = rollout.unroll(env, env_state, actor, key, config.unroll_length, keep)
+            keys = jax.random.split(key, config.unroll_length)
+            env_state, kept, stats = rollout.unroll(env, env_state, actor, keys, keep)
             return env_state, (*kept, env_state.env.obs, stats)
 
         env_state, scores = env.renew(state.env, pool_key, policy_params(state), state.updates)

@@ -1,0 +1,112 @@
+"""TD3 and DDPG: targets and updates worked out by hand on linear networks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy_tasks import ToyTask
+
+from mjx_walk import networks
+from mjx_walk.algos.ddpg import DDPGConfig
+from mjx_walk.algos.td3 import TD3Config, make_deterministic_learner
+from mjx_walk.off_policy import Batch
+from mjx_walk.types import Transition
+
+LINEAR = {
+    "policy_hidden_layer_sizes": (),
+    "critic_hidden_layer_sizes": (),
+    "discount": 0.9,
+    "tau": 0.25,
+    "policy_learning_rate": 0.01,
+    "critic_learning_rate": 0.1,
+}
+
+
+def critic(*rows):
+    """One linear critic for each row: weight of the observation, weight of the action, bias."""
+    return {
+        "params": {
+            f"MLP_{i}": {"hidden_0": {"kernel": jnp.float32([[obs], [action]]), "bias": jnp.float32([bias])}}
+            for i, (obs, action, bias) in enumerate(rows)
+        }
+    }
+
+
+def batch():
+    """Two transitions from observation 0 to 1, under action 0.25; the second one terminates."""
+    obs = jnp.float32([[0.0], [0.0]])
+    return Batch(
+        transitions=Transition(obs, obs + 0.25, jnp.float32([3.0, 3.0]), jnp.float32([0.5, 0.0]), obs + 1.0),
+        normalizer=networks.init_normalizer(1),
+        reward_scale=jnp.float32(2.0),
+        rate_factor=1.0,
+    )
+
+
+@pytest.fixture
+def loud_noise(monkeypatch):
+    """Every draw of Gaussian noise is 4."""
+    monkeypatch.setattr(jax.random, "normal", lambda key, shape: jnp.full(shape, 4.0))
+
+
+def make(config, num_critics, *smoothing):
+    learner = make_deterministic_learner(ToyTask(), 2, config, num_critics, *smoothing)
+    state = learner.init(jax.random.PRNGKey(0))
+    state = state.replace(policy=jax.tree.map(jnp.zeros_like, state.policy))
+    return learner, state.replace(target_policy=state.policy)
+
+
+def test_td3_critic_update(loud_noise):
+    """Target action: tanh(0) + clip(0.2 · 4, ±0.5) = 0.5. Targets' values there: 1 + 2 · 0.5 = 2 and 1 − 2 · 0.5 + 1
+    = 1, of which 1 counts. So y = 2 · 3 + 0.5 · 0.9 · 1 = 6.45 and, terminated, 6."""
+    learner, state = make(TD3Config(**LINEAR), 2, 0.2, 0.5)
+    state = state.replace(
+        critic=critic((0.0, 2.0, 0.0), (0.0, 0.0, 1.0)), target_critic=critic((1.0, 2.0, 0.0), (1.0, -2.0, 1.0))
+    )
+    new, metrics = learner.critic_update(state, batch(), jax.random.PRNGKey(0))
+    first, second = 0.5, 1.0  # what the two critics say now
+    expected = np.mean([(first - 6.45) ** 2, (first - 6.0) ** 2]) + np.mean([(second - 6.45) ** 2, (second - 6.0) ** 2])
+    assert metrics["critic_loss"] == pytest.approx(expected, rel=1e-6)
+    assert metrics["critic_value"] == pytest.approx(0.75)
+    # Adam's first step has the size of the learning rate, towards the target; the observation is 0 and gives none.
+    expected = critic((0.0, 2.1, 0.1), (0.0, 0.1, 1.1))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), new.critic, expected)
+    for untouched in ("policy", "target_policy", "target_critic"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(new, untouched), getattr(state, untouched))
+
+
+def test_td3_full_update_moves_policy_and_targets(loud_noise):
+    learner, state = make(TD3Config(**LINEAR), 2, 0.2, 0.5)
+    state = state.replace(
+        critic=critic((0.0, 2.0, 0.0), (0.0, -9.0, 1.0)), target_critic=critic((1.0, 2.0, 0.0), (1.0, -2.0, 1.0))
+    )
+    new, _ = learner.full_update(state, batch(), jax.random.PRNGKey(0))
+    # The policy climbs the first critic, whose value rises with the action.
+    layer = new.policy["params"]["hidden_0"]
+    assert float(layer["bias"][0]) == pytest.approx(0.01, rel=1e-4) and float(layer["kernel"][0, 0]) == 0.0
+    for target, old, moved in (
+        (new.target_policy, state.target_policy, new.policy),
+        (new.target_critic, state.target_critic, new.critic),
+    ):
+        expected = jax.tree.map(lambda t, p: 0.75 * t + 0.25 * p, old, moved)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), target, expected)
+
+
+def test_ddpg_has_one_critic_and_no_smoothing(loud_noise):
+    """Target action 0, so y = 6 + 0.45 · (1 + 0) and 6."""
+    assert DDPGConfig().policy_delay == 1
+    learner, state = make(DDPGConfig(**LINEAR), 1, 0.0, 0.0)
+    assert len(state.critic["params"]) == 1
+    state = state.replace(critic=critic((0.0, 2.0, 0.0)), target_critic=critic((1.0, 2.0, 0.0)))
+    _, metrics = learner.critic_update(state, batch(), jax.random.PRNGKey(0))
+    assert metrics["critic_loss"] == pytest.approx(np.mean([(0.5 - 6.45) ** 2, (0.5 - 6.0) ** 2]), rel=1e-6)
+
+
+def test_each_copy_explores_with_its_own_noise():
+    config = TD3Config(**LINEAR, min_exploration_noise=0.0, max_exploration_noise=0.2)
+    learner, state = make(config, 2, 0.2, 0.5)
+    params = (networks.init_normalizer(1), state.policy)
+    obs = jnp.zeros((2, 1))
+    draws = jax.vmap(lambda key: learner.explore(params, obs, key))(jax.random.split(jax.random.PRNGKey(1), 2000))
+    np.testing.assert_allclose(draws.std(axis=0)[:, 0], [0.0, 0.2], rtol=0.1)
+    assert (learner.act(params, obs, jax.random.PRNGKey(0), True) == 0).all()
