@@ -15,14 +15,16 @@ import jax
 import jax.numpy as jnp
 
 from mjx_walk import cli
-from mjx_walk.algos import make_algorithm
+from mjx_walk.algos import ALGORITHMS, make_algorithm
 from mjx_walk.api import make_task, resolve
 from mjx_walk.config import Config, compile_cache_dir
 from mjx_walk.envs import TASKS, State, Task
 from mjx_walk.envs.physics import make_engine
+from mjx_walk.errors import UserError
 from mjx_walk.evaluation import versions
 from mjx_walk.loop import make_chunk, make_init
-from mjx_walk.peers import brax_ppo_speed
+from mjx_walk.off_policy import OffPolicyConfig
+from mjx_walk.replay import ReplayBuffer, Steps
 from mjx_walk.settings import setting
 
 USAGE = """
@@ -31,7 +33,8 @@ usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [physics=auto] [num_en
 
   num_envs   copies; by default those of the recipe for this hardware
   seconds    how long each speed is measured
-  peers      also Brax's PPO on Brax's own, reduced humanoid (some minutes, most of them compiling)
+  peers      also Brax's PPO (algo=ppo) or SAC (algo=sac) on Brax's own, reduced humanoid: some minutes, most of
+             them compiling
   out        the table as JSON, with versions
 """
 
@@ -39,7 +42,7 @@ usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [physics=auto] [num_en
 @dataclasses.dataclass
 class Arguments:
     env: str = setting("humanoid", choices=tuple(TASKS))
-    algo: str = setting("ppo", choices=("ppo",))
+    algo: str = setting("ppo", choices=tuple(ALGORITHMS))
     physics: str = "auto"
     num_envs: int | None = setting(None, at_least=1)
     seconds: float = setting(5.0, above=0)
@@ -50,6 +53,8 @@ class Arguments:
 def main(arguments: list[str]) -> None:
     """Measure, print a table, write JSON if asked."""
     parsed = cli.parse(Arguments, arguments, USAGE)
+    if parsed.peers and parsed.algo not in ("ppo", "sac"):
+        raise UserError(f"Brax has no {parsed.algo} to compare with; leave peers out, or choose algo=ppo or algo=sac")
     overrides = [f"env={parsed.env}", f"algo={parsed.algo}", f"physics={parsed.physics}"]
     if parsed.num_envs:
         overrides.append(f"num_envs={parsed.num_envs}")
@@ -76,10 +81,12 @@ def main(arguments: list[str]) -> None:
     report("training / Gymnasium on one core", results["training"] / gym_speed, "times")
     for name, value in peak_memory().items():
         report(name, value, "GiB")
+    if issubclass(ALGORITHMS[parsed.algo][1], OffPolicyConfig):
+        for name, value in insert_times(task).items():
+            report(name, value * 1e6, "µs")
     if parsed.peers:
-        sizes = (2048, 1024, 32, 30) if config.hardware == "gpu" else (32, 16, 2, 3)
-        speed = brax_ppo_speed(*sizes)
-        report(f"Brax's PPO on its reduced humanoid, {sizes[0]} copies", speed, "env-steps/s")
+        for name, value, unit in peer_figures(parsed.algo, config.hardware):
+            report(name, value, unit)
     if parsed.out:
         content = {"env": task.gymnasium_id, "device": device, "results": results, "versions": versions()}
         Path(parsed.out).write_text(json.dumps(content, indent=1))
@@ -147,7 +154,10 @@ def step_speed(task: Task, num_envs: int, seconds: float) -> float:
 
 def training_figures(config: Config, task: Task, seconds: float) -> dict[str, float]:
     """Training end to end as the loop runs it, and the compile time of its programs without and with a cache."""
-    algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
+    settings = config.algo
+    if isinstance(settings, OffPolicyConfig):
+        settings = dataclasses.replace(settings, prefill_steps=0)
+    algorithm = make_algorithm(task, config.num_envs, config.evaluation, settings)
     old_cache = compile_cache_dir()
     figures = {}
     with tempfile.TemporaryDirectory() as cache:
@@ -156,13 +166,51 @@ def training_figures(config: Config, task: Task, seconds: float) -> dict[str, fl
             jax.clear_caches()
             jax.experimental.compilation_cache.compilation_cache.reset_cache()
             start = time.monotonic()
-            chunk = make_chunk(algorithm, 1, fused=task.engine.name != "c")
+            chunk = make_chunk(algorithm, config.updates_per_chunk, fused=task.engine.name != "c")
             state = make_init(algorithm)(jax.random.PRNGKey(0))
             state = jax.block_until_ready(chunk(state)[0])
             figures[name] = time.monotonic() - start
         jax.config.update("jax_compilation_cache_dir", old_cache)
-    speed = steps_per_second(lambda state: chunk(state)[0], state, algorithm.steps_per_update, seconds)
+    steps_per_chunk = algorithm.steps_per_update * config.updates_per_chunk
+    speed = steps_per_second(lambda state: chunk(state)[0], state, steps_per_chunk, seconds)
     return figures | {"training": speed}
+
+
+def insert_times(task: Task) -> dict[str, float]:
+    """Seconds that inserting 4,096 transitions into a replay of a million takes, empty and full."""
+    num_envs, num_rows, unroll, repeats = 1024, 1000, 4, 50
+    buffer = ReplayBuffer(task, num_envs, num_rows)
+    shape = (unroll, num_envs)
+    obs, flags = jnp.zeros((*shape, task.observation_size)), jnp.zeros(shape, bool)
+    steps = Steps(obs, jnp.zeros((*shape, task.action_size)), jnp.zeros(shape), flags, flags, obs)
+    insert = jax.jit(buffer.insert, donate_argnums=0)
+    replay = jax.block_until_ready(insert(buffer.init(), steps))
+    times = {}
+    for name, rows in (("empty", 0), ("full", num_rows)):
+        replay = jax.block_until_ready(replay.replace(rows=jnp.int32(rows)))
+        start = time.monotonic()
+        for _ in range(repeats):
+            replay = insert(replay, steps)
+        jax.block_until_ready(replay)
+        times[f"insert of 4,096 transitions, {name} replay"] = (time.monotonic() - start) / repeats
+    return times
+
+
+def peer_figures(algo: str, hardware: str) -> list[tuple[str, float, str]]:
+    """Names, values and units of what Brax's trainer of the same algorithm reaches on this machine."""
+    from mjx_walk import peers  # Brax's trainers take seconds to import
+
+    if algo == "ppo":
+        ppo_sizes = (2048, 1024, 32, 30) if hardware == "gpu" else (32, 16, 2, 3)
+        speed = peers.brax_ppo_speed(*ppo_sizes)
+        return [(f"Brax's PPO on its reduced humanoid, {ppo_sizes[0]} copies", speed, "env-steps/s")]
+    sac_sizes = (128, 512, 8, 1_000_000, 300) if hardware == "gpu" else (16, 64, 4, 20_000, 20)
+    ours, theirs = peers.sac_update_speeds(*sac_sizes)
+    return [
+        ("our SAC on Brax's humanoid", ours, "updates/s"),
+        ("Brax's SAC on Brax's humanoid", theirs, "updates/s"),
+        ("ours / Brax's", ours / theirs, "times"),
+    ]
 
 
 def peak_memory() -> dict[str, float]:

@@ -206,7 +206,7 @@ def _read(path: Path) -> HostArrays:
 
 
 def _crc32(array: np.ndarray) -> int:
-    return zlib.crc32(np.ascontiguousarray(array).view(np.uint8))
+    return zlib.crc32(np.ascontiguousarray(array).view(np.uint8).data)
 
 
 def _named_leaves(tree: Any) -> dict[str, Any]:

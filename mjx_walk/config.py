@@ -168,7 +168,9 @@ def _one_line(error: BaseException, overrides: list[str]) -> str:
     """What the user needs of a Hydra error: its useful detail often sits in the cause."""
     texts = [str(error), str(error.__cause__ or "")]
     if any("not in struct" in text or "not in '" in text or "Could not override" in text for text in texts):
-        valid = list(flatten(load_config([o for o in overrides if o.startswith(("env=", "algo=", "hardware="))])))
+        valid = list(
+            flatten(load_config([o for o in overrides if o.startswith(("env=", "algo=", "hardware=", "recipe="))]))
+        )
         given = [override.split("=", 1)[0] for override in overrides]
         unknown = [key for key in given if key not in valid and key not in ("env", "algo", "recipe", "hardware")]
         if unknown:
@@ -179,13 +181,16 @@ def _one_line(error: BaseException, overrides: list[str]) -> str:
     if "Could not find 'recipe/" in texts[0]:
         names = sorted(str(p.relative_to(Path(CONFIG_DIR) / "recipe"))[:-5] for p in _recipes())
         return f"{_first_line(error)}; recipes: {', '.join(names)}"
+    if "raised while composing config" in texts[0]:  # Hydra's first line names the file, the second what is wrong
+        file, wrong = (line.strip() for line in texts[0].splitlines()[:2])
+        return f"{file.partition(':')[0]}: {wrong}; this recipe does not suit the env and algo that were asked for"
     key = getattr(error, "full_key", None) or getattr(error.__cause__, "full_key", None)
     detail = _first_line(error.__cause__ or error)
     return f"{key}: {detail}" if key else detail
 
 
 def _recipes() -> list[Path]:
-    return list((Path(CONFIG_DIR) / "recipe").glob("**/*.yaml"))
+    return list((Path(CONFIG_DIR) / "recipe").glob("**/[!_]*.yaml"))
 
 
 def default_run_dir(config: Config, now: str) -> Path:

@@ -148,7 +148,7 @@ class Trainer:
         """
         num_episodes = self.config.evaluation.gymnasium_episodes
         if num_episodes:
-            scored = []
+            scored: list[tuple[Scores, Any, dict[str, Any]]] = []
             for params, facts in self._policies:
                 if not scored or facts["eval_return"] > scored[0][0].mean:
                     scored.append((self._score_in_gymnasium(params, num_episodes), params, facts))

@@ -136,7 +136,7 @@ def make_off_policy(
     buffer = ReplayBuffer(task, num_envs, unrolls_kept * config.unroll_length, config.replay_dtype)
     if config.prefill_steps > buffer.num_transitions:
         raise UserError(
-            f"algo.prefill_steps={config.prefill_steps} is more than algo.replay_capacity={config.replay_capacity} holds"
+            f"algo.prefill_steps={config.prefill_steps} is more than algo.replay_capacity={config.replay_capacity}"
         )
     rows_before_learning = max(-(-config.prefill_steps // num_envs), config.n_step + 1)
 

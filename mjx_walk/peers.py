@@ -3,10 +3,51 @@
 import time
 from typing import Any
 
+import brax.envs
 import jax
 import jax.numpy as jnp
+from brax.training.agents.ppo import train as ppo
+from brax.training.agents.sac import networks as sac_networks
+from brax.training.agents.sac import train as sac
+
+from mjx_walk.algos.sac import SACConfig, make_sac
+from mjx_walk.envs import State, TaskOptions
+from mjx_walk.envs.physics import PhysicsState
+from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.loop import make_chunk, make_init
 
 _UNROLL_LENGTH = 10
+_EPISODE_LENGTH = 1000
+
+
+class BraxTask:
+    """An environment of Brax's behind the face of a `Task`, so that our trainer and Brax's meet on the same one."""
+
+    def __init__(self, env: brax.envs.Env):
+        self.env = env
+        self.options = TaskOptions(name="brax", max_episode_steps=_EPISODE_LENGTH)
+        self.observation_size, self.action_size = env.observation_size, env.action_size
+        self.action_low, self.action_high = -jnp.ones(env.action_size), jnp.ones(env.action_size)
+        self.reward_terms: tuple[str, ...] = ()
+
+    def reset(self, key: jax.Array) -> State:
+        return self._state(self.env.reset(key), jnp.zeros((), jnp.int32))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return self._state(self.env.step(state.memory["brax"], action), state.steps + 1)
+
+    def _state(self, theirs: brax.envs.State, steps: jax.Array) -> State:
+        empty, zero = jnp.zeros(0), jnp.float32(0.0)
+        return State(
+            physics=PhysicsState(empty, empty, empty),
+            memory={"brax": theirs},
+            obs=theirs.obs,
+            reward=jnp.float32(theirs.reward),
+            terminated=theirs.done > 0.5,
+            truncated=steps >= _EPISODE_LENGTH,
+            steps=steps,
+            metrics={"nonfinite": zero, "overflow": zero},
+        )
 
 
 def restore_device_put_replicated() -> None:
@@ -32,16 +73,13 @@ def brax_ppo_speed(num_envs: int, batch_size: int, num_minibatches: int, num_upd
         num_minibatches: minibatches of an update.
         num_updates: updates measured, after as many that compile and warm up.
     """
-    from brax import envs
-    from brax.training.agents.ppo import train as ppo
-
     restore_device_put_replicated()
     clock: list[tuple[float, int]] = []
     ppo.train(
-        environment=envs.get_environment("humanoid", backend="mjx"),
+        environment=brax.envs.get_environment("humanoid", backend="mjx"),
         num_timesteps=2 * num_updates * batch_size * num_minibatches * _UNROLL_LENGTH,
         num_evals=3,  # so that the clock is read after each half
-        episode_length=1000,
+        episode_length=_EPISODE_LENGTH,
         num_envs=num_envs,
         unroll_length=_UNROLL_LENGTH,
         batch_size=batch_size,
@@ -58,3 +96,66 @@ def brax_ppo_speed(num_envs: int, batch_size: int, num_minibatches: int, num_upd
     )
     (start, steps_before), (end, steps_after) = clock[-2:]
     return (steps_after - steps_before) / (end - start)
+
+
+def sac_update_speeds(
+    num_envs: int, batch_size: int, updates_per_step: int, replay_capacity: int, num_steps: int
+) -> tuple[float, float]:
+    """Gradient updates per second of our SAC and of Brax's, on Brax's `humanoid`, once the replay is full.
+
+    Environment, networks (256-256), batch, updates per step and replay are the same; an update is one of critic,
+    policy and temperature.
+
+    Args:
+        num_envs: copies.
+        batch_size: of an update.
+        updates_per_step: for each step of all copies.
+        replay_capacity: transitions, all of them filled under an untrained policy before the clock starts.
+        num_steps: steps of all copies that are timed, after as many that compile and warm up.
+
+    Returns:
+        Ours and theirs.
+    """
+    env = brax.envs.get_environment("humanoid", backend="mjx")
+    config = SACConfig(
+        unroll_length=1,
+        updates_per_step=updates_per_step,
+        batch_size=batch_size,
+        replay_capacity=replay_capacity,
+        prefill_steps=replay_capacity,
+        observation_clip=None,
+    )
+    algorithm = make_sac(BraxTask(env), num_envs, EvaluationConfig(1), config)  # type: ignore[arg-type]
+    chunk = make_chunk(algorithm, num_steps, fused=True)
+    state = make_init(algorithm)(jax.random.PRNGKey(0))
+    while int(state.critic_updates) == 0:
+        state, _ = chunk(state)
+    before, start = int(state.critic_updates), time.monotonic()
+    state, _ = jax.block_until_ready(chunk(state))
+    ours = (int(state.critic_updates) - before) / (time.monotonic() - start)
+    del state
+
+    restore_device_put_replicated()
+    speeds: list[float] = []
+    prefill = -(-replay_capacity // num_envs) * num_envs
+    sac.train(
+        environment=env,
+        num_timesteps=prefill + 2 * num_steps * num_envs,
+        num_evals=3,  # so that two pieces of equal length are timed; the first one compiles
+        num_eval_envs=1,
+        episode_length=_EPISODE_LENGTH,
+        num_envs=num_envs,
+        learning_rate=config.policy_learning_rate,
+        discounting=config.discount,
+        batch_size=batch_size,
+        normalize_observations=True,
+        tau=config.tau,
+        min_replay_size=replay_capacity,
+        max_replay_size=replay_capacity,
+        grad_updates_per_step=updates_per_step,
+        network_factory=lambda *args, **kwargs: sac_networks.make_sac_networks(
+            *args, hidden_layer_sizes=(256, 256), **kwargs
+        ),
+        progress_fn=lambda _, metrics: speeds.append(float(metrics.get("training/sps", 0.0))),
+    )
+    return ours, speeds[-1] / num_envs * updates_per_step

@@ -10,7 +10,7 @@ from mjx_walk.config import CONFIG_DIR, flatten, load_config, read_config, save_
 from mjx_walk.envs import TASKS
 
 RECIPES = sorted(
-    str(path.relative_to(f"{CONFIG_DIR}/recipe"))[:-5] for path in Path(CONFIG_DIR).glob("recipe/*/*.yaml")
+    str(path.relative_to(f"{CONFIG_DIR}/recipe"))[:-5] for path in Path(CONFIG_DIR).glob("recipe/?pu/[!_]*.yaml")
 )
 
 
@@ -27,8 +27,15 @@ def test_every_recipe_fits(recipe):
 
 
 def test_there_is_a_recipe_for_every_task_on_every_hardware():
-    own = [recipe for recipe in RECIPES if not recipe.startswith("report/")]
-    assert len(own) == 2 * len(TASKS) * len(ALGORITHMS)
+    assert len(RECIPES) == 2 * len(TASKS) * len(ALGORITHMS)
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in Path(CONFIG_DIR).glob("recipe/report/*.yaml")))
+def test_the_reports_recipes_name_their_own_task_and_algorithm(name):
+    config = load_config([f"recipe=report/{name}"])
+    assert config.algo.name == name.partition("_")[2] and config.evaluation.num_envs == 10
+    algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
+    assert algorithm.steps_per_update == config.num_envs
 
 
 def test_without_an_accelerator_the_small_recipe_is_chosen():

@@ -155,7 +155,7 @@ def test_mountain_car_is_solved(name):
     make, config_class = ALGORITHMS[name]
     config = config_class(**SETTINGS[name] | changes | own.get(name, {"max_exploration_noise": 1.0}))
     algorithm = make(toy_tasks.MountainCar(), 64, EvaluationConfig(8), config)
-    state, metrics = make_chunk(algorithm, 700, fused=True)(make_init(algorithm)(jax.random.PRNGKey(0)))
+    _, metrics = make_chunk(algorithm, 700, fused=True)(make_init(algorithm)(jax.random.PRNGKey(0)))
     scores = metrics["eval_return"][~jnp.isnan(metrics["eval_return"])]
     assert scores[-1] > 90 > 10 > scores[0]
     assert metrics["replay_transitions"][-1] == 200_192

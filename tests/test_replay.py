@@ -37,7 +37,9 @@ def play(num_envs, num_steps, limit, seed=0):
         step = step + 1
         terminated, truncated = rng.random(num_envs) < 0.12, step >= limit
         next_obs = np.stack([np.arange(num_envs), episode, step], axis=1)
-        rows.append((obs, rng.uniform(-1, 1, (num_envs, 1)), rng.normal(size=num_envs), terminated, truncated, next_obs))
+        rows.append(
+            (obs, rng.uniform(-1, 1, (num_envs, 1)), rng.normal(size=num_envs), terminated, truncated, next_obs)
+        )
         done = terminated | truncated
         episode, step = episode + done, np.where(done, 0, step)
     return [np.stack(column) for column in zip(*rows, strict=True)]
@@ -102,7 +104,11 @@ def test_insertion_writes_in_place():
     task = Counter(1000)
     buffer = ReplayBuffer(task, 64, 4096)
     steps = Steps(
-        jnp.zeros((2, 64, 3)), jnp.zeros((2, 64, 1)), jnp.zeros((2, 64)), *jnp.zeros((2, 2, 64), bool), jnp.zeros((2, 64, 3))
+        jnp.zeros((2, 64, 3)),
+        jnp.zeros((2, 64, 1)),
+        jnp.zeros((2, 64)),
+        *jnp.zeros((2, 2, 64), bool),
+        jnp.zeros((2, 64, 3)),
     )
     compiled = jax.jit(buffer.insert, donate_argnums=0).lower(buffer.init(), steps).compile()
     memory = compiled.memory_analysis()
