@@ -23,7 +23,7 @@ def test_walker2d_walks_after_the_cpu_recipe(tmp_path):
 @pytest.mark.parametrize("version", ["v5", "v4"])
 @pytest.mark.parametrize("name", TASKS)
 def test_parity_of_all_versions(name, version, physics):
-    found = parity.check(name, version, physics, num_copies=24, num_steps=70)
+    found = parity.check(name, version, physics, num_copies=48, num_steps=120)
     assert found.is_within, "\n".join(map(str, found.errors))
 
 

@@ -8,8 +8,11 @@ from mujoco.mjx._src import forward as mjx_forward
 from mujoco.mjx._src import scan as mjx_scan
 from mujoco.mjx._src import smooth as mjx_smooth
 
+from mjx_walk.envs.physics import capsule_frames_jax
 from mjx_walk.envs.physics.base import Derived, PhysicsState
 from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
+
+capsule_frames_jax.install()
 
 _RK4_STEP = (0.0, 0.5, 0.5, 1.0)
 _RK4_WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)

@@ -7,8 +7,11 @@ import numpy as np
 import warp as wp
 from mujoco import mjx
 
+from mjx_walk.envs.physics import capsule_frames_warp
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
+
+capsule_frames_warp.install()
 
 CONTACTS_PER_COPY = 40
 """Room for geom pairs that may touch, and then for contacts, of a copy on average; the batch shares both buffers.

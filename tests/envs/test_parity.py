@@ -2,12 +2,13 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from mjx_walk import parity
 from mjx_walk.envs import TASKS, make_env
-from mjx_walk.envs.physics import mjx_warp
+from mjx_walk.envs.physics import PhysicsState, make_engine, mjx_warp
 
 CASES = [(name, "v5", physics) for name in TASKS for physics in ("jax", "warp")] + [("humanoid", "v4", "warp")]
 
@@ -19,6 +20,33 @@ def test_one_step_from_standing_airborne_and_fallen_states(name, version, physic
     assert found.num_steps >= 1600
     if name != "humanoid_standup":  # both sides of the healthy range were visited
         assert 100 < found.num_terminations < found.num_steps - 100
+
+
+TILTED_CAPSULE = """
+<mujoco>
+  <option integrator="RK4" timestep="0.003"/>
+  <worldbody>
+    <geom type="plane" size="5 5 1"/>
+    <body pos="0 0 0.19"><freejoint/><geom type="capsule" size="0.1 0.1" mass="1"/></body>
+  </worldbody>
+  <actuator/>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("physics", ["jax", "warp"])
+@pytest.mark.parametrize("tilt", [5.0, 25.0, 60.0])
+def test_a_steep_capsule_slides_as_in_c(physics, tilt):
+    """Its contact's tangent follows its axis: MJX as released takes a default one within 30° of the normal."""
+    model = mujoco.MjModel.from_xml_string(TILTED_CAPSULE)
+    half, azimuth = np.deg2rad(tilt) / 2, np.deg2rad(35.0)
+    quaternion = [np.cos(half), np.sin(half) * np.cos(azimuth), np.sin(half) * np.sin(azimuth), 0.0]
+    height = 0.1 + 0.1 * np.cos(2 * half) - 0.005
+    qpos = jnp.float32([0.0, 0.0, height, *quaternion])
+    state = PhysicsState(qpos, jnp.float32([0.7, 0.2, 0, 0, 0, 0]), jnp.zeros(6))
+    found, expected = (make_engine(name, model, 1, ()).step(state, jnp.zeros(0))[0] for name in (physics, "c"))
+    assert np.abs(np.asarray(expected.qvel) - state.qvel).max() > 1e-3
+    np.testing.assert_allclose(found.qvel, expected.qvel, atol=2e-4)
 
 
 def test_a_wrong_engine_is_noticed():

@@ -1,0 +1,35 @@
+"""The same for MuJoCo Warp as `capsule_frames_jax` for MJX, which says why."""
+
+# mypy: ignore-errors
+# Warp compiles the function's source, in a language of its own that looks like Python.
+
+import warp as wp
+from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive
+from mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core import mat23f
+from mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core import plane_capsule as upstream_plane_capsule
+
+
+@wp.func
+def plane_capsule(
+    plane_normal: wp.vec3,
+    plane_pos: wp.vec3,
+    capsule_pos: wp.vec3,
+    capsule_axis: wp.vec3,
+    capsule_radius: float,
+    capsule_half_length: float,
+) -> tuple[wp.vec2, mat23f, wp.mat33]:
+    dist, pos, frame = upstream_plane_capsule(
+        plane_normal, plane_pos, capsule_pos, capsule_axis, capsule_radius, capsule_half_length
+    )
+    tangent = wp.normalize(capsule_axis - plane_normal * wp.dot(plane_normal, capsule_axis))
+    if wp.length_sq(tangent) < 0.5:  # a capsule along the normal has no such direction
+        tangent = wp.vec3(1.0, 0.0, 0.0)
+    n = plane_normal
+    c = wp.cross(n, tangent)
+    frame = wp.mat33(n[0], n[1], n[2], tangent[0], tangent[1], tangent[2], c[0], c[1], c[2])
+    return dist, pos, frame
+
+
+def install() -> None:
+    """Have Warp's collision kernels call it; before they are built."""
+    collision_primitive.plane_capsule = plane_capsule
