@@ -167,6 +167,9 @@ def _first_line(error: BaseException) -> str:
 def _one_line(error: BaseException, overrides: list[str]) -> str:
     """What the user needs of a Hydra error: its useful detail often sits in the cause."""
     texts = [str(error), str(error.__cause__ or "")]
+    if "raised while composing config" in texts[0]:  # Hydra's first line names the file, the second what is wrong
+        file, wrong = (line.strip() for line in texts[0].splitlines()[:2])
+        return f"{file.partition(':')[0]}: {wrong}; this recipe does not suit the env and algo that were asked for"
     if any("not in struct" in text or "not in '" in text or "Could not override" in text for text in texts):
         valid = list(
             flatten(load_config([o for o in overrides if o.startswith(("env=", "algo=", "hardware=", "recipe="))]))
@@ -181,9 +184,6 @@ def _one_line(error: BaseException, overrides: list[str]) -> str:
     if "Could not find 'recipe/" in texts[0]:
         names = sorted(str(p.relative_to(Path(CONFIG_DIR) / "recipe"))[:-5] for p in _recipes())
         return f"{_first_line(error)}; recipes: {', '.join(names)}"
-    if "raised while composing config" in texts[0]:  # Hydra's first line names the file, the second what is wrong
-        file, wrong = (line.strip() for line in texts[0].splitlines()[:2])
-        return f"{file.partition(':')[0]}: {wrong}; this recipe does not suit the env and algo that were asked for"
     key = getattr(error, "full_key", None) or getattr(error.__cause__, "full_key", None)
     detail = _first_line(error.__cause__ or error)
     return f"{key}: {detail}" if key else detail

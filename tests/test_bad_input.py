@@ -14,10 +14,10 @@ from mjx_walk.errors import UserError
 
 CASES = [
     (["env=ant"], "unknown env 'ant'; choose one of: humanoid, humanoid_standup, walker2d"),
-    (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo, sac, td3, ddpg"),
+    (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo, sac, td3, ddpg, a2c"),
     (["physics=bullet"], "physics=bullet: choose one of: auto, warp, jax, c"),
     (["env.version=v3"], "env.version=v3: choose one of: v5, v4"),
-    (["recipe=nope"], "recipes: cpu/humanoid_ddpg"),
+    (["recipe=nope"], "recipes: cpu/humanoid_a2c"),
     (["recipe=report/e_td3", "algo=sac"], "this recipe does not suit the env and algo that were asked for"),
     (["num_env=4"], "unknown key 'num_env'; did you mean: num_envs"),
     (["algo.discont=0.9"], "unknown key 'algo.discont'; did you mean: algo.discount"),

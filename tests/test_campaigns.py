@@ -11,9 +11,10 @@ from mjx_walk.envs import TASKS
 pytestmark = pytest.mark.slow
 
 
-def test_walker2d_walks_after_the_cpu_recipe(tmp_path):
+@pytest.mark.parametrize("algo", ["ppo", "td3"])
+def test_walker2d_walks_after_the_cpu_recipe(tmp_path, algo):
     """The command a user without a GPU types, with its score in the real Gymnasium."""
-    done = command("train", "env=walker2d", f"run_dir={tmp_path}/run", timeout=1800)
+    done = command("train", "env=walker2d", f"algo={algo}", f"run_dir={tmp_path}/run", timeout=2400)
     assert done.returncode == 0, done.stderr
     scores = json.loads((tmp_path / "run" / "eval_gymnasium.json").read_text())
     assert scores["mean"] >= 2000 and len(scores["returns"]) == 100
@@ -27,18 +28,19 @@ def test_parity_of_all_versions(name, version, physics):
     assert found.is_within, "\n".join(map(str, found.errors))
 
 
+OWN = {
+    "ppo": ("algo.num_minibatches=4", "algo.num_epochs=2"),
+    "sac": ("algo.updates_per_step=1", "algo.batch_size=64", "algo.prefill_steps=256", "updates_per_chunk=1"),
+}
+
+
 @pytest.mark.parametrize("physics", ["jax", "warp"])
-def test_humanoid_trains_through_mjx(tmp_path, physics):
+@pytest.mark.parametrize("algo", OWN)
+def test_humanoid_trains_through_mjx(tmp_path, algo, physics):
     """A small batch, from the command to the score, on each MJX engine."""
-    small = (
-        "num_envs=16",
-        "evaluation.num_envs=2",
-        "total_steps=4096",
-        "algo.unroll_length=16",
-        "env.max_episode_steps=50",
-    )
-    minibatches = ("algo.num_minibatches=4", "algo.num_epochs=2", "evaluation.gymnasium_episodes=4")
-    done = command("train", f"physics={physics}", f"run_dir={tmp_path}/run", *small, *minibatches)
+    small = ("num_envs=16", "evaluation.num_envs=2", "total_steps=4096", "algo.unroll_length=16")
+    ends = ("env.max_episode_steps=50", "evaluation.gymnasium_episodes=4", f"run_dir={tmp_path}/run")
+    done = command("train", f"algo={algo}", f"physics={physics}", *small, *ends, *OWN[algo])
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert len(rows) == 16 and all(row["physics/nonfinite"] == row["physics/overflow"] == 0 for row in rows)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from mjx_walk.algos.a2c import A2CConfig, make_a2c
 from mjx_walk.algos.ddpg import DDPGConfig, make_ddpg
 from mjx_walk.algos.ppo import PPOConfig, make_ppo
 from mjx_walk.algos.sac import SACConfig, make_sac
@@ -15,6 +16,7 @@ ALGORITHMS: dict[str, tuple[Any, type]] = {
     "sac": (make_sac, SACConfig),
     "td3": (make_td3, TD3Config),
     "ddpg": (make_ddpg, DDPGConfig),
+    "a2c": (make_a2c, A2CConfig),
 }
 
 __all__ = ["ALGORITHMS", "make_algorithm"]

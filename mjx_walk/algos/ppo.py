@@ -3,93 +3,33 @@
 import dataclasses
 import functools
 import math
-from typing import Any
 
-import flax
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.agents.ppo import losses as ppo_losses
-from brax.training.agents.ppo import networks as brax_ppo_networks
-from brax.training.networks import ACTIVATION
 
-from mjx_walk import networks, returns, rollout
+from mjx_walk import networks
 from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
-from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
-from mjx_walk.optimizers import descend, make_adam
-from mjx_walk.schedules import anneal
+from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy
+from mjx_walk.optimizers import descend
 from mjx_walk.settings import setting
-from mjx_walk.types import Algorithm, Metrics, Transition
-from mjx_walk.wrappers import VectorEnv, VectorState
+from mjx_walk.types import Algorithm, Metrics
 
 
 @dataclasses.dataclass
-class PPOConfig:
+class PPOConfig(OnPolicyConfig):
     """Settings of PPO; the recipe of each task changes some of them."""
 
     name: str = setting("ppo", choices=("ppo",))
-    unroll_length: int = setting(10, at_least=1)
-    """Steps of one trajectory piece, over which advantages are estimated."""
-    num_unrolls: int = setting(4, at_least=1)
-    """Pieces of every copy in one batch."""
     num_minibatches: int = setting(32, at_least=1)
     num_epochs: int = setting(8, at_least=1)
-    learning_rate: float = setting(3e-4, above=0)
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
     """`linear`: to zero over `schedule_steps`; `adaptive_kl`: kept near `target_kl`, and annealed as well."""
     target_kl: float = setting(0.01, above=0)
-    schedule_steps: int = setting(100_000_000, at_least=1)
-    """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
-    max_policy_grad_norm: float = setting(1.0, above=0)
-    max_value_grad_norm: float | None = setting(None, above=0)
-    """By default policy and value are clipped together by `max_policy_grad_norm`, as Brax does."""
-    discount: float = setting(0.97, at_least=0, at_most=1)
-    gae_lambda: float = setting(0.95, at_least=0, at_most=1)
     clip_epsilon: float = setting(0.3, above=0)
-    entropy_cost: float = setting(1e-3, at_least=0)
-    entropy_schedule: str = setting("constant", choices=("constant", "linear"))
-    """`linear`: to zero over `schedule_steps`."""
-    value_cost: float = setting(0.5, above=0)
-    reward_scale: float = setting(0.1, above=0)
-    normalize_rewards: bool = False
-    """Divide rewards by the running std of the discounted return, before `reward_scale`."""
-    normalize_advantages: bool = True
-    observation_clip: float | None = setting(10.0, above=0)
-    """Bound of normalised observations."""
-    policy_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 128), at_least=1)
-    value_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 256, 256), at_least=1)
-    activation: str = setting("swish", choices=tuple(ACTIVATION))
-    distribution: str = setting("tanh_normal", choices=("tanh_normal", "normal"))
-    init_noise_std: float = setting(1.0, above=0)
-    """Of the `normal` distribution only."""
-    stagger_episodes: bool = True
-
-
-class PPOState(flax.struct.PyTreeNode):
-    """Everything that influences PPO's next update."""
-
-    params: ppo_losses.PPONetworkParams
-    optimizer: optax.OptState
-    learning_rate: jax.Array
-    """Of the `adaptive_kl` schedule; else constant."""
-    normalizer: RunningStatisticsState
-    return_scale: returns.ReturnScale
-    env: VectorState
-    key: jax.Array
-    updates: jax.Array
-    """`[] i32`: updates done."""
-
-
-class PPOBatch(flax.struct.PyTreeNode):
-    """What one `collect` hands to `learn`; N pieces of T steps."""
-
-    transitions: Transition
-    """`[N, T, …]`. What Brax's loss does not read is left out: `action` is empty (it takes the raw action from
-    `extras`), and `next_observation` holds the last step's only, `[N, 1, …]`."""
-    reward_scale: jax.Array
-    stats: Metrics
 
 
 def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PPOConfig) -> Algorithm:
@@ -110,91 +50,12 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
             f"num_envs={num_envs} times algo.num_unrolls={config.num_unrolls} does not divide into "
             f"algo.num_minibatches={config.num_minibatches}; choose num_envs a multiple of {divisor}"
         )
-    nets = networks.make_ppo_networks(task, config)
+    ground = make_on_policy(task, num_envs, evaluation, config)
+    nets, optimizer = ground.nets, ground.optimizer
 
-    def policy(policy_params, deterministic: bool = True):
-        act = brax_ppo_networks.make_inference_fn(nets)(policy_params, deterministic=deterministic)
-        return lambda obs, key: networks.to_env_action(task, act(obs, key)[0])
-
-    def policy_params(state: PPOState) -> Any:
-        return (state.normalizer, state.params.policy)
-
-    steps_per_update = num_envs * config.unroll_length * config.num_unrolls
-    evaluator = LiveEvaluator(task, num_envs, evaluation, policy, steps_per_update)
-    env = VectorEnv(task, num_envs, evaluator, config.stagger_episodes)
-    optimizer = _make_optimizer(config)
-
-    def init(key: jax.Array) -> PPOState:
-        policy_key, value_key, env_key, key = jax.random.split(key, 4)
-        params = ppo_losses.PPONetworkParams(
-            policy=nets.policy_network.init(policy_key), value=nets.value_network.init(value_key)
-        )
-        normalizer = networks.init_normalizer(task.observation_size)
-        return PPOState(
-            params=params,
-            optimizer=optimizer.init(params),
-            learning_rate=jnp.float32(config.learning_rate),
-            normalizer=normalizer,
-            return_scale=returns.init_return_scale(num_envs),
-            env=env.init(env_key, (normalizer, params.policy)),
-            key=key,
-            updates=jnp.zeros((), jnp.int32),
-        )
-
-    def collect(state: PPOState) -> tuple[PPOState, PPOBatch]:
-        key, pool_key, run_key = jax.random.split(state.key, 3)
-        sample = brax_ppo_networks.make_inference_fn(nets)((state.normalizer, state.params.policy))
-        reward_scale = jnp.float32(config.reward_scale)
-        if config.normalize_rewards:
-            reward_scale *= returns.reward_multiplier(state.return_scale)
-
-        def actor(obs, key):
-            action, extras = sample(obs, key)
-            return networks.to_env_action(task, action), extras
-
-        def lost_value(outcome, truncated):
-            """Values of observations that a time limit cut off; computed only at steps where there are any."""
-            return jax.lax.cond(
-                truncated.any(),
-                lambda obs: nets.value_network.apply(state.normalizer, state.params.value, obs),
-                lambda obs: jnp.zeros(obs.shape[0], jnp.float32),
-                outcome.obs,
-            )
-
-        def keep(step: rollout.Step):
-            outcome = step.outcome
-            truncated = outcome.truncated & ~outcome.terminated
-            value = lost_value(outcome, truncated)
-            transition = Transition(
-                observation=step.obs,
-                action=(),
-                reward=returns.bootstrap_truncated(outcome.reward, truncated, value, config.discount, reward_scale),
-                discount=1.0 - jnp.float32(outcome.terminated | truncated),
-                next_observation=(),
-                extras={"policy_extras": step.extras, "state_extras": {"truncation": jnp.zeros(num_envs)}},
-            )
-            return transition, outcome.reward, outcome.terminated | truncated
-
-        def piece(env_state, key):
-            keys = jax.random.split(key, config.unroll_length)
-            env_state, kept, stats = rollout.unroll(env, env_state, actor, keys, keep)
-            return env_state, (*kept, env_state.env.obs, stats)
-
-        env_state, scores = env.renew(state.env, pool_key, policy_params(state), state.updates)
-        keys = jax.random.split(run_key, config.num_unrolls)
-        env_state, (transitions, reward, done, last_obs, stats) = jax.lax.scan(piece, env_state, keys)
-        # Where an episode ended at a piece's last step, last_obs belongs to the next one: its discount is 0.
-        transitions = jax.tree.map(_pieces_first, transitions)
-        transitions = transitions._replace(next_observation=last_obs.reshape((-1, 1, last_obs.shape[-1])))
-        return_scale = returns.update_return_scale(
-            state.return_scale, reward.reshape((-1, num_envs)), done.reshape((-1, num_envs)), config.discount
-        )
-        batch = PPOBatch(transitions, reward_scale, jax.tree.map(lambda x: x.sum(0), stats) | scores)
-        return state.replace(env=env_state, return_scale=return_scale, key=key), batch
-
-    def learn(state: PPOState, batch: PPOBatch) -> tuple[PPOState, Metrics]:
+    def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         key, update_key = jax.random.split(state.key)
-        remaining = anneal(state.updates * float(steps_per_update), config.schedule_steps)
+        remaining = ground.remaining(state)
         is_adaptive = config.learning_rate_schedule == "adaptive_kl"
         rate_factor = 1.0 if config.learning_rate_schedule == "constant" else remaining
         # KL compares distributions under one normalizer, so with adaptive_kl it moves after the update.
@@ -249,20 +110,7 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
             "reward_scale": batch.reward_scale,
         }
 
-    return Algorithm(init, collect, learn, policy_params, policy, steps_per_update)
-
-
-def _pieces_first(x: jax.Array) -> jax.Array:
-    """`[U, T, B, …]` to `[U·B, T, …]`."""
-    x = jnp.swapaxes(x, 1, 2)
-    return x.reshape((-1, *x.shape[2:]))
-
-
-def _make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    if config.max_value_grad_norm is None:
-        return make_adam(config.max_policy_grad_norm)
-    parts = {"policy": make_adam(config.max_policy_grad_norm), "value": make_adam(config.max_value_grad_norm)}
-    return optax.partition(parts, ppo_losses.PPONetworkParams(policy="policy", value="value"))
+    return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)
 
 
 def _adapt_rate(rate: jax.Array, kl: jax.Array, target: float) -> jax.Array:
