@@ -58,7 +58,10 @@ def _grid(rows: list[Row], names: list[str], ylabel: str, path: Path) -> Path:
     columns = min(len(names), 4) or 1
     lines = -(-len(names) // columns) or 1
     figure = matplotlib.figure.Figure(figsize=(3.4 * columns, 2.4 * lines), layout="constrained")
-    for plot, name in zip(figure.subplots(lines, columns, squeeze=False).flat, names, strict=False):
+    plots = figure.subplots(lines, columns, squeeze=False).flat
+    for unused in plots[len(names) :]:
+        unused.set_axis_off()
+    for plot, name in zip(plots, names, strict=False):
         xs, ys = _series(rows, "env_steps", name)
         plot.plot([x / 1e6 for x in xs], ys)
         plot.set_title(name.partition("/")[2], fontsize=9)
