@@ -98,7 +98,9 @@ class OnPolicyGround(NamedTuple):
     """The share of the schedules that is left."""
 
 
-def make_on_policy(task: Task, num_envs: int, evaluation: EvaluationConfig, config: OnPolicyConfig) -> OnPolicyGround:
+def make_on_policy(
+    task: Task, num_envs: int, evaluation: EvaluationConfig, config: OnPolicyConfig, has_value: bool = True
+) -> OnPolicyGround:
     """Build all but `learn`.
 
     Args:
@@ -106,6 +108,8 @@ def make_on_policy(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
         num_envs: copies that learn.
         evaluation: of the policy beside them.
         config: settings.
+        has_value: whether there is a value network. With one, time limits are bootstrapped through, and a truncated
+            step reaches `learn` as a terminated one; without, as `truncation`.
     """
     nets = networks.make_ppo_networks(task, config)
 
@@ -124,7 +128,8 @@ def make_on_policy(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
     def init(key: jax.Array) -> OnPolicyState:
         policy_key, value_key, env_key, key = jax.random.split(key, 4)
         params = ppo_losses.PPONetworkParams(
-            policy=nets.policy_network.init(policy_key), value=nets.value_network.init(value_key)
+            policy=nets.policy_network.init(policy_key),
+            value=nets.value_network.init(value_key) if has_value else {},
         )
         normalizer = networks.init_normalizer(task.observation_size)
         return OnPolicyState(
@@ -161,16 +166,20 @@ def make_on_policy(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
         def keep(step: rollout.Step):
             outcome = step.outcome
             truncated = outcome.truncated & ~outcome.terminated
-            value = lost_value(outcome, truncated)
+            reward, terminated = outcome.reward, outcome.terminated
+            if has_value:
+                value = lost_value(outcome, truncated)
+                reward = returns.bootstrap_truncated(reward, truncated, value, config.discount, reward_scale)
+                terminated, truncated = terminated | truncated, jnp.zeros_like(truncated)
             transition = Transition(
                 observation=step.obs,
                 action=(),
-                reward=returns.bootstrap_truncated(outcome.reward, truncated, value, config.discount, reward_scale),
-                discount=1.0 - jnp.float32(outcome.terminated | truncated),
+                reward=reward,
+                discount=1.0 - jnp.float32(terminated),
                 next_observation=(),
-                extras={"policy_extras": step.extras, "state_extras": {"truncation": jnp.zeros(num_envs)}},
+                extras={"policy_extras": step.extras, "state_extras": {"truncation": jnp.float32(truncated)}},
             )
-            return transition, outcome.reward, outcome.terminated | truncated
+            return transition, outcome.reward, outcome.terminated | outcome.truncated
 
         def piece(env_state, key):
             keys = jax.random.split(key, config.unroll_length)

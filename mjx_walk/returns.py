@@ -41,6 +41,35 @@ def n_step_return(reward: jax.Array, ended: jax.Array, discount: float) -> tuple
     return (still_on * discount**steps * reward).sum(axis=0), still_on.sum(axis=0, dtype=jnp.int32)
 
 
+def returns_to_go(
+    reward: jax.Array, terminated: jax.Array, truncated: jax.Array, discount: float
+) -> tuple[jax.Array, jax.Array]:
+    """Discounted rewards from each step to its episode's end, as far as they were seen.
+
+    Args:
+        reward: `[T, N]`.
+        terminated: `[T, N] bool`.
+        truncated: `[T, N] bool`; the episode was cut off after this step.
+        discount: γ.
+
+    Returns:
+        The sums, `[T, N] f32`; and the factor at which the future that was not seen would enter, `[T, N] f32`: 0 where
+        the episode terminated, else γ to the number of steps to the cut or to the last of the T.
+    """
+
+    def back(carry, step):
+        later, unseen = carry
+        reward, terminated, truncated = step
+        is_end = terminated | truncated
+        later = reward + discount * jnp.where(is_end, 0.0, later)
+        unseen = discount * jnp.where(terminated, 0.0, jnp.where(truncated, 1.0, unseen))
+        return (later, unseen), (later, unseen)
+
+    none = jnp.zeros(reward.shape[1:], jnp.float32)
+    _, sums = jax.lax.scan(back, (none, none + 1.0), (reward, terminated, truncated), reverse=True)
+    return sums
+
+
 class ReturnScale(flax.struct.PyTreeNode):
     """Running variance of the discounted return, by which rewards may be normalised.
 

@@ -14,7 +14,7 @@ from mjx_walk.errors import UserError
 
 CASES = [
     (["env=ant"], "unknown env 'ant'; choose one of: humanoid, humanoid_standup, walker2d"),
-    (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo, sac, td3, ddpg, a2c"),
+    (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo, sac, td3, ddpg, a2c, reinforce"),
     (["physics=bullet"], "physics=bullet: choose one of: auto, warp, jax, c"),
     (["env.version=v3"], "env.version=v3: choose one of: v5, v4"),
     (["recipe=nope"], "recipes: cpu/humanoid_a2c"),

@@ -4,11 +4,17 @@ import jax.numpy as jnp
 import numpy as np
 from brax.training.agents.ppo.losses import compute_gae
 
-from mjx_walk.returns import bootstrap_truncated, init_return_scale, reward_multiplier, update_return_scale
+from mjx_walk.returns import (
+    bootstrap_truncated,
+    init_return_scale,
+    returns_to_go,
+    reward_multiplier,
+    update_return_scale,
+)
 
 
 def test_truncation_bootstraps_and_termination_does_not():
-    """Brax's GAE, fed as `ppo.collect` feeds it, against sums done by hand. γ = 0.5, λ = 1, values all 8."""
+    """Brax's GAE, fed as `on_policy.collect` feeds it, against sums done by hand. γ = 0.5, λ = 1, values all 8."""
     reward = jnp.array([[1.0, 1.0, 1.0]] * 2)  # [T=2, B=3]: goes on, truncated at 0, terminated at 0
     truncated = jnp.array([[False, True, False], [False, False, False]])
     ended = jnp.array([[0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
@@ -44,3 +50,13 @@ def test_return_scale_is_the_std_of_discounted_returns():
         running[d] = 0.0
     np.testing.assert_allclose(reward_multiplier(scale), 1 / np.std(returns), rtol=1e-4)
     np.testing.assert_allclose(scale.mean, np.mean(returns), rtol=1e-4)
+
+
+def test_returns_to_go_by_hand():
+    """Three copies: one terminates after the second step, one is cut off there, one goes on."""
+    reward = jnp.float32([[1.0, 1.0, 1.0], [2.0, 2.0, 2.0], [4.0, 4.0, 4.0]])
+    terminated = jnp.array([[False, False, False], [True, False, False], [False, False, False]])
+    truncated = jnp.array([[False, False, False], [False, True, False], [False, False, False]])
+    sums, unseen = returns_to_go(reward, terminated, truncated, 0.5)
+    np.testing.assert_allclose(sums, [[2.0, 2.0, 3.0], [2.0, 2.0, 4.0], [4.0, 4.0, 4.0]])
+    np.testing.assert_allclose(unseen, [[0.0, 0.25, 0.125], [0.0, 0.5, 0.25], [0.5, 0.5, 0.5]])

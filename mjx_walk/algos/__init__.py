@@ -5,6 +5,7 @@ from typing import Any
 from mjx_walk.algos.a2c import A2CConfig, make_a2c
 from mjx_walk.algos.ddpg import DDPGConfig, make_ddpg
 from mjx_walk.algos.ppo import PPOConfig, make_ppo
+from mjx_walk.algos.reinforce import REINFORCEConfig, make_reinforce
 from mjx_walk.algos.sac import SACConfig, make_sac
 from mjx_walk.algos.td3 import TD3Config, make_td3
 from mjx_walk.envs import Task
@@ -17,6 +18,7 @@ ALGORITHMS: dict[str, tuple[Any, type]] = {
     "td3": (make_td3, TD3Config),
     "ddpg": (make_ddpg, DDPGConfig),
     "a2c": (make_a2c, A2CConfig),
+    "reinforce": (make_reinforce, REINFORCEConfig),
 }
 
 __all__ = ["ALGORITHMS", "make_algorithm"]

@@ -1,0 +1,108 @@
+"""REINFORCE (Williams 1992) for many copies: the policy gradient on returns as they came, without a value network."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from mjx_walk import networks, returns
+from mjx_walk.envs import Task
+from mjx_walk.errors import UserError
+from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy
+from mjx_walk.optimizers import descend
+from mjx_walk.settings import setting
+from mjx_walk.types import Algorithm, Metrics
+
+
+@dataclasses.dataclass
+class REINFORCEConfig(OnPolicyConfig):
+    """Settings of REINFORCE; the recipe of each task changes some of them. Those for advantages and values do nothing
+    here."""
+
+    name: str = setting("reinforce", choices=("reinforce",))
+    unroll_length: int = setting(256, at_least=1)
+    num_unrolls: int = setting(1, at_least=1)
+    num_minibatches: int = setting(1, at_least=1)
+    """Gradient steps on a batch, each on copies of its own."""
+    max_unseen: float = setting(0.05, above=0, at_most=1)
+    """Steps whose return leaves out a future that would count more than this are not learned from."""
+    learning_rate_schedule: str = setting("constant", choices=("constant", "linear"))
+    """`linear`: to zero over `schedule_steps`."""
+
+
+def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, config: REINFORCEConfig) -> Algorithm:
+    """Build REINFORCE for a task.
+
+    Deviation: a copy does not wait for the others' episodes to end. A batch is a piece of `unroll_length` steps, and a
+    step counts if its episode ended within the piece, or if what follows is discounted away (`max_unseen`).
+
+    Args:
+        task: the unbatched environment.
+        num_envs: copies that learn.
+        evaluation: of the policy beside them.
+        config: settings.
+
+    Raises:
+        UserError: the copies do not divide into the minibatches.
+    """
+    if num_envs * config.num_unrolls % config.num_minibatches:
+        raise UserError(f"num_envs={num_envs} does not divide into algo.num_minibatches={config.num_minibatches}")
+    ground = make_on_policy(task, num_envs, evaluation, config, has_value=False)
+    distribution = ground.nets.parametric_action_distribution
+
+    def loss(params, normalizer, data, entropy_cost, key):
+        """`data`: transitions, normalised returns and weights, `[N, T, …]`."""
+        transitions, advantage, weight = data
+        logits = ground.nets.policy_network.apply(normalizer, params.policy, transitions.observation)
+        log_prob = distribution.log_prob(logits, transitions.extras["policy_extras"]["raw_action"])
+        entropy = distribution.entropy(logits, key).mean()
+        policy_loss = -(weight * advantage * log_prob).sum() / jnp.maximum(weight.sum(), 1.0)
+        return policy_loss - entropy_cost * entropy, {"policy_loss": policy_loss, "entropy": entropy}
+
+    def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
+        key, shuffle_key, loss_key = jax.random.split(state.key, 3)
+        remaining = ground.remaining(state)
+        rate = state.learning_rate * (remaining if config.learning_rate_schedule == "linear" else 1.0)
+        entropy_cost = config.entropy_cost * (remaining if config.entropy_schedule == "linear" else 1.0)
+        transitions = batch.transitions._replace(next_observation=())
+        normalizer = networks.update_normalizer(state.normalizer, transitions.observation)
+        return_to_go, unseen = returns.returns_to_go(
+            transitions.reward.T,
+            transitions.discount.T == 0.0,
+            transitions.extras["state_extras"]["truncation"].T > 0.0,
+            config.discount,
+        )
+        weight = jnp.float32(config.max_unseen >= unseen.T)
+        advantage = _normalize(return_to_go.T * batch.reward_scale, weight)
+
+        def minibatch(carry, inputs):
+            params, opt_state = carry
+            rows, key = inputs
+            data = jax.tree.map(lambda x: x[rows], (transitions, advantage, weight))
+            grads, metrics = jax.grad(loss, has_aux=True)(params, normalizer, data, entropy_cost, key)
+            return descend(ground.optimizer, params, grads, opt_state, rate), metrics | {
+                "grad_norm": optax.global_norm(grads)
+            }
+
+        rows = jax.random.permutation(shuffle_key, weight.shape[0]).reshape((config.num_minibatches, -1))
+        keys = jax.random.split(loss_key, config.num_minibatches)
+        (params, opt_state), metrics = jax.lax.scan(minibatch, (state.params, state.optimizer), (rows, keys))
+        new_state = state.replace(
+            params=params, optimizer=opt_state, normalizer=normalizer, key=key, updates=state.updates + 1
+        )
+        return new_state, batch.stats | jax.tree.map(jnp.mean, metrics) | {
+            "learned_from": weight.mean(),
+            "learning_rate": jnp.float32(rate),
+            "reward_scale": batch.reward_scale,
+        }
+
+    return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)
+
+
+def _normalize(values: jax.Array, weight: jax.Array) -> jax.Array:
+    """To mean 0 and std 1 over what counts."""
+    total = jnp.maximum(weight.sum(), 1.0)
+    centred = values - (weight * values).sum() / total
+    return centred / jnp.sqrt((weight * centred**2).sum() / total + 1e-8)
