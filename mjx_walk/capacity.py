@@ -2,7 +2,9 @@
 
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -28,8 +30,7 @@ def check_replay(algorithm: Algorithm, run_dir: Path) -> str | None:
     """
     if not algorithm.replay_bytes:
         return None
-    shapes = jax.tree.leaves(jax.eval_shape(algorithm.init, jax.random.PRNGKey(0)))
-    checkpoint_bytes = sum(x.size * x.dtype.itemsize for x in shapes)
+    checkpoint_bytes = num_bytes(algorithm.init, jax.random.PRNGKey(0))
     replay, disk = f"{algorithm.replay_bytes / 1e9:,.2f} GB", f"{2 * checkpoint_bytes / 1e9:,.2f} GB"
     memory = device_memory()
     if algorithm.replay_bytes > _USABLE * memory:
@@ -44,6 +45,11 @@ def check_replay(algorithm: Algorithm, run_dir: Path) -> str | None:
             "algo.replay_capacity or choose another run_dir"
         )
     return f"Replay: {replay} of device memory, and while a checkpoint replaces the one before up to {disk} of disk."
+
+
+def num_bytes(make: Callable[..., Any], *args: Any) -> int:
+    """Bytes of the pytree that `make` would return, without making it."""
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(make, *args)))
 
 
 def device_memory() -> int:

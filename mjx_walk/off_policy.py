@@ -15,7 +15,7 @@ from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
 from mjx_walk.replay import Replay, ReplayBuffer, Steps
-from mjx_walk.schedules import anneal
+from mjx_walk.schedules import anneal, factor
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics, PolicyFn, Transition
 from mjx_walk.wrappers import VectorEnv, VectorState
@@ -198,9 +198,8 @@ def make_off_policy(
         reward_scale = jnp.float32(config.reward_scale)
         if config.normalize_rewards:
             reward_scale *= returns.reward_multiplier(return_scale)
-        rate_factor = jnp.float32(1.0)
-        if config.learning_rate_schedule == "linear":
-            rate_factor = anneal(state.updates * float(steps_per_update), config.schedule_steps)
+        remaining = anneal(state.updates * float(steps_per_update), config.schedule_steps)
+        rate_factor = factor(config.learning_rate_schedule, remaining)
         replay = buffer.insert(state.replay, steps)
 
         def draw(key):

@@ -1,6 +1,7 @@
 """What on-policy algorithms share: networks, and collecting trajectories whose time limits are bootstrapped through."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from brax.training.networks import ACTIVATION
 
 from mjx_walk import networks, returns, rollout
 from mjx_walk.envs import Task
+from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
 from mjx_walk.optimizers import make_adam
 from mjx_walk.schedules import anneal
@@ -32,6 +34,8 @@ class OnPolicyConfig:
     num_unrolls: int = setting(4, at_least=1)
     """Pieces of every copy in one batch."""
     learning_rate: float = setting(3e-4, above=0)
+    learning_rate_schedule: str = setting("constant", choices=("constant", "linear"))
+    """`linear`: to zero over `schedule_steps`."""
     schedule_steps: int = setting(100_000_000, at_least=1)
     """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
     max_policy_grad_norm: float = setting(1.0, above=0)
@@ -202,6 +206,20 @@ def make_on_policy(
         return anneal(state.updates * float(steps_per_update), config.schedule_steps)
 
     return OnPolicyGround(nets, optimizer, init, collect, policy_params, policy, steps_per_update, remaining)
+
+
+def require_whole_minibatches(num_envs: int, num_unrolls: int, num_minibatches: int) -> None:
+    """Check that the pieces of a batch can be dealt out evenly.
+
+    Raises:
+        UserError: they cannot.
+    """
+    if num_envs * num_unrolls % num_minibatches:
+        divisor = num_minibatches // math.gcd(num_minibatches, num_unrolls)
+        raise UserError(
+            f"num_envs={num_envs} times algo.num_unrolls={num_unrolls} does not divide into "
+            f"algo.num_minibatches={num_minibatches}; choose num_envs a multiple of {divisor}"
+        )
 
 
 def _pieces_first(x: jax.Array) -> jax.Array:

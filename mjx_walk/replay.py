@@ -6,6 +6,7 @@ import flax
 import jax
 import jax.numpy as jnp
 
+from mjx_walk.capacity import num_bytes
 from mjx_walk.envs import Task
 from mjx_walk.returns import n_step_return
 from mjx_walk.types import Transition
@@ -70,8 +71,7 @@ class ReplayBuffer:
     @property
     def num_bytes(self) -> int:
         """Memory of a buffer, full or empty."""
-        shapes = jax.tree.leaves(jax.eval_shape(self.init))
-        return sum(x.size * x.dtype.itemsize for x in shapes)
+        return num_bytes(self.init)
 
     def init(self) -> Replay:
         """An empty buffer."""

@@ -12,6 +12,7 @@ from mjx_walk.envs import Task
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy
 from mjx_walk.optimizers import descend
+from mjx_walk.schedules import factor
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics, Transition
 
@@ -22,8 +23,6 @@ class A2CConfig(OnPolicyConfig):
 
     name: str = setting("a2c", choices=("a2c",))
     num_unrolls: int = setting(1, at_least=1)
-    learning_rate_schedule: str = setting("constant", choices=("constant", "linear"))
-    """`linear`: to zero over `schedule_steps`."""
 
 
 def make_a2c(task: Task, num_envs: int, evaluation: EvaluationConfig, config: A2CConfig) -> Algorithm:
@@ -65,8 +64,8 @@ def make_a2c(task: Task, num_envs: int, evaluation: EvaluationConfig, config: A2
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         key, loss_key = jax.random.split(state.key)
         remaining = ground.remaining(state)
-        rate = state.learning_rate * (remaining if config.learning_rate_schedule == "linear" else 1.0)
-        entropy_cost = config.entropy_cost * (remaining if config.entropy_schedule == "linear" else 1.0)
+        rate = state.learning_rate * factor(config.learning_rate_schedule, remaining)
+        entropy_cost = config.entropy_cost * factor(config.entropy_schedule, remaining)
         normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
         data = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batch.transitions)
         grads, metrics = jax.grad(loss, has_aux=True)(

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +10,10 @@ from brax.training.agents.ppo import losses as ppo_losses
 
 from mjx_walk import networks
 from mjx_walk.envs import Task
-from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy
+from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy, require_whole_minibatches
 from mjx_walk.optimizers import descend
+from mjx_walk.schedules import factor
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -44,12 +43,7 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
     Raises:
         UserError: the batch does not divide into the minibatches.
     """
-    if num_envs * config.num_unrolls % config.num_minibatches:
-        divisor = config.num_minibatches // math.gcd(config.num_minibatches, config.num_unrolls)
-        raise UserError(
-            f"num_envs={num_envs} times algo.num_unrolls={config.num_unrolls} does not divide into "
-            f"algo.num_minibatches={config.num_minibatches}; choose num_envs a multiple of {divisor}"
-        )
+    require_whole_minibatches(num_envs, config.num_unrolls, config.num_minibatches)
     ground = make_on_policy(task, num_envs, evaluation, config)
     nets, optimizer = ground.nets, ground.optimizer
 
@@ -57,14 +51,14 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
         key, update_key = jax.random.split(state.key)
         remaining = ground.remaining(state)
         is_adaptive = config.learning_rate_schedule == "adaptive_kl"
-        rate_factor = 1.0 if config.learning_rate_schedule == "constant" else remaining
+        rate_factor = factor(config.learning_rate_schedule, remaining)
         # KL compares distributions under one normalizer, so with adaptive_kl it moves after the update.
         new_normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
         normalizer = state.normalizer if is_adaptive else new_normalizer
         loss_fn = functools.partial(
             ppo_losses.compute_ppo_loss,
             ppo_network=nets,
-            entropy_cost=config.entropy_cost * (remaining if config.entropy_schedule == "linear" else 1.0),
+            entropy_cost=config.entropy_cost * factor(config.entropy_schedule, remaining),
             discounting=config.discount,
             reward_scaling=batch.reward_scale,
             gae_lambda=config.gae_lambda,

@@ -8,10 +8,10 @@ import optax
 
 from mjx_walk import networks, returns
 from mjx_walk.envs import Task
-from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy
+from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy, require_whole_minibatches
 from mjx_walk.optimizers import descend
+from mjx_walk.schedules import factor
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -28,8 +28,6 @@ class REINFORCEConfig(OnPolicyConfig):
     """Gradient steps on a batch, each on copies of its own."""
     max_unseen: float = setting(0.05, above=0, at_most=1)
     """Steps whose return leaves out a future that would count more than this are not learned from."""
-    learning_rate_schedule: str = setting("constant", choices=("constant", "linear"))
-    """`linear`: to zero over `schedule_steps`."""
 
 
 def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, config: REINFORCEConfig) -> Algorithm:
@@ -45,10 +43,9 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
         config: settings.
 
     Raises:
-        UserError: the copies do not divide into the minibatches.
+        UserError: the batch does not divide into the minibatches.
     """
-    if num_envs * config.num_unrolls % config.num_minibatches:
-        raise UserError(f"num_envs={num_envs} does not divide into algo.num_minibatches={config.num_minibatches}")
+    require_whole_minibatches(num_envs, config.num_unrolls, config.num_minibatches)
     ground = make_on_policy(task, num_envs, evaluation, config, has_value=False)
     distribution = ground.nets.parametric_action_distribution
 
@@ -64,8 +61,8 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         key, shuffle_key, loss_key = jax.random.split(state.key, 3)
         remaining = ground.remaining(state)
-        rate = state.learning_rate * (remaining if config.learning_rate_schedule == "linear" else 1.0)
-        entropy_cost = config.entropy_cost * (remaining if config.entropy_schedule == "linear" else 1.0)
+        rate = state.learning_rate * factor(config.learning_rate_schedule, remaining)
+        entropy_cost = config.entropy_cost * factor(config.entropy_schedule, remaining)
         transitions = batch.transitions._replace(next_observation=())
         normalizer = networks.update_normalizer(state.normalizer, transitions.observation)
         return_to_go, unseen = returns.returns_to_go(
