@@ -1,6 +1,7 @@
 """What wraps Brax's networks: the observation normalizer, and actions in Gymnasium's units."""
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +11,7 @@ from brax.training import networks as brax_networks
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.sac import networks as sac_networks
-from brax.training.distribution import NormalTanhDistribution
+from brax.training.distribution import NormalDistribution, NormalTanhDistribution
 from brax.training.networks import ACTIVATION
 
 from mjx_walk.envs import Task
@@ -25,17 +26,18 @@ def make_ppo_networks(task: Task, config: Any) -> ppo_networks.PPONetworks:
     Args:
         task: gives the sizes.
         config: with `policy_hidden_layer_sizes`, `value_hidden_layer_sizes`, `activation`, `distribution`
-            (`tanh_normal`: state-dependent std, squashed; `normal`: state-independent std, unbounded),
-            `init_noise_std` and `observation_clip`.
+            (`tanh_normal`: state-dependent std, squashed; `normal`: unbounded, std dependent or not),
+            `init_noise_std`, `state_dependent_std`, `min_log_std`, `max_log_std` and `observation_clip`.
     """
     normal_only: dict[str, Any] = {}
     if config.distribution == "normal":
         normal_only = {
             "noise_std_type": "log",
             "init_noise_std": config.init_noise_std,
+            "state_dependent_std": config.state_dependent_std,
             "mean_kernel_init_fn": functools.partial(jax.nn.initializers.variance_scaling, 1e-4, "fan_in", "uniform"),
         }
-    return ppo_networks.make_ppo_networks(
+    nets = ppo_networks.make_ppo_networks(
         task.observation_size,
         task.action_size,
         preprocess_observations_fn=_preprocess(config),
@@ -45,6 +47,21 @@ def make_ppo_networks(task: Task, config: Any) -> ppo_networks.PPONetworks:
         distribution_type=config.distribution,
         **normal_only,
     )
+    if config.distribution == "normal":
+        nets = nets.replace(parametric_action_distribution=_BoundedNormal(task.action_size, config))
+    return nets
+
+
+class _BoundedNormal(NormalDistribution):
+    """Brax's, with a std that is kept from vanishing and from running away."""
+
+    def __init__(self, event_size: int, config: Any):
+        super().__init__(event_size)
+        self._std_bounds = math.exp(config.min_log_std), math.exp(config.max_log_std)
+
+    def create_dist(self, parameters):
+        mean, std = parameters
+        return super().create_dist((mean, jnp.clip(std, *self._std_bounds)))
 
 
 def make_sac_networks(task: Task, config: Any) -> sac_networks.SACNetworks:

@@ -202,24 +202,28 @@ def make_off_policy(
         rate_factor = factor(config.learning_rate_schedule, remaining)
         replay = buffer.insert(state.replay, steps)
 
-        def draw(key):
-            drawn = buffer.sample(replay, key, config.batch_size, config.n_step, config.discount)
-            return Batch(drawn, normalizer, reward_scale, rate_factor)
+        def as_batch(transitions: Transition) -> Batch:
+            return Batch(transitions, normalizer, reward_scale, rate_factor)
 
-        def critic_update(learner_state, key):
-            sample_key, key = jax.random.split(key)
-            return learner.critic_update(learner_state, draw(sample_key), key)[0], None
+        def critic_update(learner_state, inputs):
+            transitions, key = inputs
+            return learner.critic_update(learner_state, as_batch(transitions), key)[0], None
 
-        def policy_period(learner_state, key):
+        def policy_period(learner_state, inputs):
             """`policy_delay` critic updates, the last of them together with the policy's."""
-            key, sample_key, *critic_keys = jax.random.split(key, config.policy_delay + 1)
-            if critic_keys:
-                learner_state, _ = jax.lax.scan(critic_update, learner_state, jnp.stack(critic_keys))
-            return learner.full_update(learner_state, draw(sample_key), key)
+            first = jax.tree.map(lambda x: x[:-1], inputs)
+            learner_state, _ = jax.lax.scan(critic_update, learner_state, first)
+            transitions, key = jax.tree.map(lambda x: x[-1], inputs)
+            return learner.full_update(learner_state, as_batch(transitions), key)
 
         def train(learner_state):
-            keys = jax.random.split(update_key, updates_per_unroll // config.policy_delay)
-            learner_state, metrics = jax.lax.scan(policy_period, learner_state, keys)
+            # Drawn in one go, since on a GPU small updates wait for the launch of their kernels.
+            sample_key, key = jax.random.split(update_key)
+            num_transitions = updates_per_unroll * config.batch_size
+            drawn = buffer.sample(replay, sample_key, num_transitions, config.n_step, config.discount)
+            periods = (updates_per_unroll // config.policy_delay, config.policy_delay)
+            drawn = jax.tree.map(lambda x: x.reshape((*periods, config.batch_size, *x.shape[1:])), drawn)
+            learner_state, metrics = jax.lax.scan(policy_period, learner_state, (drawn, jax.random.split(key, periods)))
             return learner_state, jax.tree.map(lambda x: x.mean(axis=0), metrics)
 
         def wait(learner_state):

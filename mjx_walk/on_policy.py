@@ -18,6 +18,7 @@ from mjx_walk import networks, returns, rollout
 from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
+from mjx_walk.noise import OrnsteinUhlenbeck
 from mjx_walk.optimizers import make_adam
 from mjx_walk.schedules import anneal
 from mjx_walk.settings import setting
@@ -57,8 +58,12 @@ class OnPolicyConfig:
     value_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 256, 256), at_least=1)
     activation: str = setting("swish", choices=tuple(ACTIVATION))
     distribution: str = setting("tanh_normal", choices=("tanh_normal", "normal"))
+    """Squashed, with a std that depends on the state, or unbounded; the next four are for the latter."""
     init_noise_std: float = setting(1.0, above=0)
-    """Of the `normal` distribution only."""
+    """Of a std that does not depend on the state."""
+    state_dependent_std: bool = False
+    min_log_std: float = setting(-20.0, at_most=0)
+    max_log_std: float = setting(2.0, at_least=0)
     stagger_episodes: bool = True
 
 
@@ -72,6 +77,8 @@ class OnPolicyState(flax.struct.PyTreeNode):
     normalizer: RunningStatisticsState
     return_scale: returns.ReturnScale
     env: VectorState
+    noise: jax.Array | tuple[()]
+    """Of exploration, where it is correlated in time, `[B, action_size]`."""
     key: jax.Array
     updates: jax.Array
     """`[] i32`: updates done."""
@@ -103,7 +110,12 @@ class OnPolicyGround(NamedTuple):
 
 
 def make_on_policy(
-    task: Task, num_envs: int, evaluation: EvaluationConfig, config: OnPolicyConfig, has_value: bool = True
+    task: Task,
+    num_envs: int,
+    evaluation: EvaluationConfig,
+    config: OnPolicyConfig,
+    has_value: bool = True,
+    exploration: OrnsteinUhlenbeck | None = None,
 ) -> OnPolicyGround:
     """Build all but `learn`.
 
@@ -114,6 +126,7 @@ def make_on_policy(
         config: settings.
         has_value: whether there is a value network. With one, time limits are bootstrapped through, and a truncated
             step reaches `learn` as a terminated one; without, as `truncation`.
+        exploration: added to the actions that the policy draws; its probability is left out of account.
     """
     nets = networks.make_ppo_networks(task, config)
 
@@ -143,6 +156,7 @@ def make_on_policy(
             normalizer=normalizer,
             return_scale=returns.init_return_scale(num_envs),
             env=env.init(env_key, (normalizer, params.policy)),
+            noise=exploration.init(num_envs, task.action_size) if exploration else (),
             key=key,
             updates=jnp.zeros((), jnp.int32),
         )
@@ -154,9 +168,10 @@ def make_on_policy(
         if config.normalize_rewards:
             reward_scale *= returns.reward_multiplier(state.return_scale)
 
-        def actor(obs, key):
+        def actor(obs, inputs):
+            key, noise = inputs
             action, extras = sample(obs, key)
-            return networks.to_env_action(task, action), extras
+            return networks.to_env_action(task, action + noise), extras
 
         def lost_value(outcome, truncated):
             """Values of observations that a time limit cut off; computed only at steps where there are any."""
@@ -185,14 +200,21 @@ def make_on_policy(
             )
             return transition, outcome.reward, outcome.terminated | outcome.truncated
 
-        def piece(env_state, key):
+        def piece(carry, key):
+            env_state, noise = carry
+            noises = jnp.zeros(config.unroll_length)
+            if exploration:
+                key, noise_key = jax.random.split(key)
+                noises = exploration.sequence(noise, noise_key, config.unroll_length)
+                noise = noises[-1]
             keys = jax.random.split(key, config.unroll_length)
-            env_state, kept, stats = rollout.unroll(env, env_state, actor, keys, keep)
-            return env_state, (*kept, env_state.env.obs, stats)
+            env_state, kept, stats = rollout.unroll(env, env_state, actor, (keys, noises), keep)
+            return (env_state, noise), (*kept, env_state.env.obs, stats)
 
         env_state, scores = env.renew(state.env, pool_key, policy_params(state), state.updates)
         keys = jax.random.split(run_key, config.num_unrolls)
-        env_state, (transitions, reward, done, last_obs, stats) = jax.lax.scan(piece, env_state, keys)
+        carry = (env_state, state.noise)
+        (env_state, noise), (transitions, reward, done, last_obs, stats) = jax.lax.scan(piece, carry, keys)
         # Where an episode ended at a piece's last step, last_obs belongs to the next one: its discount is 0.
         transitions = jax.tree.map(_pieces_first, transitions)
         transitions = transitions._replace(next_observation=last_obs.reshape((-1, 1, last_obs.shape[-1])))
@@ -200,7 +222,7 @@ def make_on_policy(
             state.return_scale, reward.reshape((-1, num_envs)), done.reshape((-1, num_envs)), config.discount
         )
         batch = OnPolicyBatch(transitions, reward_scale, jax.tree.map(lambda x: x.sum(0), stats) | scores)
-        return state.replace(env=env_state, return_scale=return_scale, key=key), batch
+        return state.replace(env=env_state, noise=noise, return_scale=return_scale, key=key), batch
 
     def remaining(state: OnPolicyState) -> jax.Array:
         return anneal(state.updates * float(steps_per_update), config.schedule_steps)

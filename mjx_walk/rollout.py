@@ -10,8 +10,8 @@ from mjx_walk.envs import Task
 from mjx_walk.types import Metrics, PolicyFn
 from mjx_walk.wrappers import Outcome, VectorEnv, VectorState
 
-Actor = Callable[[jax.Array, jax.Array], tuple[jax.Array, Any]]
-"""`(obs [B, …], key) → (action [B, action_size] in Gymnasium's units, extras)`."""
+Actor = Callable[[jax.Array, Any], tuple[jax.Array, Any]]
+"""`(obs [B, …], key or more) → (action [B, action_size] in Gymnasium's units, extras)`."""
 
 
 class Step(NamedTuple):
@@ -27,7 +27,7 @@ def unroll(
     env: VectorEnv,
     state: VectorState,
     actor: Actor,
-    keys: jax.Array,
+    keys: Any,
     keep: Callable[[Step], Any],
 ) -> tuple[VectorState, Any, Metrics]:
     """Step all copies T times.
@@ -36,7 +36,7 @@ def unroll(
         env: the copies.
         state: where they are.
         actor: chooses actions.
-        keys: `[T]` random keys, for the actor.
+        keys: `[T]` random keys, or a tree of `[T, …]`, for the actor.
         keep: what of each step to store; whatever it drops takes no memory.
 
     Returns:

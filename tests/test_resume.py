@@ -66,6 +66,19 @@ def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
     assert not (tmp_path / "whole" / "checkpoints" / "best" / "replay").exists()
 
 
+@pytest.mark.parametrize("algo", ["a2c", "reinforce"])
+def test_policy_gradient_resume_is_exact(tmp_path, algo):
+    settings = [f"algo={algo}", "updates_per_chunk=1", *(["algo.ou_noise_std=0.1"] if algo == "a2c" else [])]
+    tiny = [setting for setting in TINY if "num_epochs" not in setting]
+    train(tmp_path / "whole", *settings, f"total_steps={4 * TINY_CHUNK}", tiny=tiny)
+    train(tmp_path / "halves", *settings, f"total_steps={2 * TINY_CHUNK}", tiny=tiny)
+    train(tmp_path / "halves", f"total_steps={4 * TINY_CHUNK}", "resume=true", tiny=[])
+    whole, halves = leaves(tmp_path / "whole", 4), leaves(tmp_path / "halves", 4)
+    assert whole.keys() == halves.keys() and len(whole) > 40 and ("noise" in whole) is (algo == "a2c")
+    for name, leaf in whole.items():
+        np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
+
+
 def test_a_replay_that_is_gone_is_filled_again(tmp_path):
     train(tmp_path / "run", "algo=sac", f"total_steps={6 * TINY_CHUNK}", tiny=TINY_OFF_POLICY)
     flip_a_byte(checkpoint.step_path(tmp_path / "run" / "checkpoints", 6 * TINY_CHUNK))

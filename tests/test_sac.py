@@ -44,10 +44,10 @@ def test_update_equals_brax(monkeypatch):
         state, _ = learn(*collect(state))
     state, (steps, stats) = collect(state)
     buffer = ReplayBuffer(task, NUM_ENVS, 16)
-    batch = buffer.sample(state.replay, jax.random.PRNGKey(7), BATCH, 1, config.discount)
-    assert set(np.asarray(batch.discount)) <= {0.0, 1.0}
+    drawn = buffer.sample(state.replay, jax.random.PRNGKey(7), UPDATES * BATCH, 1, config.discount)
+    assert set(np.asarray(drawn.discount)) <= {0.0, 1.0}
 
-    monkeypatch.setattr(ReplayBuffer, "sample", lambda *_: batch)
+    monkeypatch.setattr(ReplayBuffer, "sample", lambda *_: drawn)
     monkeypatch.setattr(jax.random, "normal", lambda key, shape: jnp.sin(jnp.arange(np.prod(shape)).reshape(shape)))
     # A new function: the one above is traced already, without the patches.
     ours, metrics = jax.jit(lambda *args: algorithm.learn(*args))(state, (steps, stats))
@@ -72,7 +72,7 @@ def test_update_equals_brax(monkeypatch):
             alpha_optimizer_state=_adam(theirs.alpha_optimizer_state, learner.alpha_optimizer),
         )
 
-    stored = batch._replace(
+    stored = drawn._replace(
         observation=steps.observation[0],
         action=steps.action[0],
         reward=steps.reward[0],
@@ -80,13 +80,12 @@ def test_update_equals_brax(monkeypatch):
         next_observation=steps.next_observation[0],
         extras={"state_extras": {"truncation": jnp.zeros(NUM_ENVS)}, "policy_extras": {}},
     )
-    drawn = batch._replace(extras=batch.extras | {"policy_extras": {}})
-    tiled = jax.tree.map(lambda x: jnp.tile(x, (UPDATES,) + (1,) * (x.ndim - 1)), drawn)
+    as_theirs = drawn._replace(extras=drawn.extras | {"policy_extras": {}})
     found = {}
     monkeypatch.setattr(brax_sac, "_init_training_state", begin_with_ours)
     monkeypatch.setattr(acting, "actor_step", lambda env, env_state, *args, **kwargs: (env_state, stored))
     queue = brax_sac.replay_buffers.UniformSamplingQueue
-    monkeypatch.setattr(queue, "sample", lambda self, buffer_state: (buffer_state, tiled))
+    monkeypatch.setattr(queue, "sample", lambda self, buffer_state: (buffer_state, as_theirs))
     monkeypatch.setattr(brax_sac.pmap, "assert_is_replicated", lambda state: found.update(state=state))
     monkeypatch.setattr(acting.Evaluator, "run_evaluation", lambda *args, **kwargs: {})
     restore_device_put_replicated()

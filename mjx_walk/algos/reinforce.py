@@ -4,14 +4,18 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import optax
 
-from mjx_walk import networks, returns
+from mjx_walk import returns
 from mjx_walk.envs import Task
 from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy, require_whole_minibatches
-from mjx_walk.optimizers import descend
-from mjx_walk.schedules import factor
+from mjx_walk.on_policy import (
+    OnPolicyBatch,
+    OnPolicyConfig,
+    OnPolicyState,
+    make_on_policy,
+    require_whole_minibatches,
+)
+from mjx_walk.policy_gradient import learn_once
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -59,12 +63,7 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
         return policy_loss - entropy_cost * entropy, {"policy_loss": policy_loss, "entropy": entropy}
 
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
-        key, shuffle_key, loss_key = jax.random.split(state.key, 3)
-        remaining = ground.remaining(state)
-        rate = state.learning_rate * factor(config.learning_rate_schedule, remaining)
-        entropy_cost = config.entropy_cost * factor(config.entropy_schedule, remaining)
         transitions = batch.transitions._replace(next_observation=())
-        normalizer = networks.update_normalizer(state.normalizer, transitions.observation)
         return_to_go, unseen = returns.returns_to_go(
             transitions.reward.T,
             transitions.discount.T == 0.0,
@@ -72,28 +71,9 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
             config.discount,
         )
         weight = jnp.float32(config.max_unseen >= unseen.T)
-        advantage = _normalize(return_to_go.T * batch.reward_scale, weight)
-
-        def minibatch(carry, inputs):
-            params, opt_state = carry
-            rows, key = inputs
-            data = jax.tree.map(lambda x: x[rows], (transitions, advantage, weight))
-            grads, metrics = jax.grad(loss, has_aux=True)(params, normalizer, data, entropy_cost, key)
-            return descend(ground.optimizer, params, grads, opt_state, rate), metrics | {
-                "grad_norm": optax.global_norm(grads)
-            }
-
-        rows = jax.random.permutation(shuffle_key, weight.shape[0]).reshape((config.num_minibatches, -1))
-        keys = jax.random.split(loss_key, config.num_minibatches)
-        (params, opt_state), metrics = jax.lax.scan(minibatch, (state.params, state.optimizer), (rows, keys))
-        new_state = state.replace(
-            params=params, optimizer=opt_state, normalizer=normalizer, key=key, updates=state.updates + 1
-        )
-        return new_state, batch.stats | jax.tree.map(jnp.mean, metrics) | {
-            "learned_from": weight.mean(),
-            "learning_rate": jnp.float32(rate),
-            "reward_scale": batch.reward_scale,
-        }
+        data = (transitions, _normalize(return_to_go.T * batch.reward_scale, weight), weight)
+        new_state, metrics = learn_once(ground, config, state, batch, data, config.num_minibatches, loss)
+        return new_state, metrics | {"learned_from": weight.mean()}
 
     return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)
 

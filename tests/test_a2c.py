@@ -1,0 +1,77 @@
+"""A2C: its losses worked out from the network's values; correlated noise; a std within bounds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy_tasks import DelayedReward, RewardedAction
+
+from mjx_walk import networks
+from mjx_walk.algos.a2c import A2CConfig, make_a2c
+from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.noise import OrnsteinUhlenbeck
+
+NUM_ENVS, STEPS = 16, 6
+GAUSSIAN = {"distribution": "normal", "policy_hidden_layer_sizes": (8,), "value_hidden_layer_sizes": (8,)}
+
+
+def collected(task, **changes):
+    """Config, algorithm, state and batch after one `collect`."""
+    config = A2CConfig(unroll_length=STEPS, reward_scale=2.0, **GAUSSIAN, **changes)
+    algorithm = make_a2c(task, NUM_ENVS, EvaluationConfig(1), config)
+    before = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
+    return config, algorithm, *jax.jit(algorithm.collect)(before)
+
+
+@pytest.mark.parametrize("gae_lambda", [0.0, 0.9])
+def test_losses(gae_lambda):
+    """With λ = 0 the advantage is the one-step temporal difference; with another one it follows from these."""
+    config, algorithm, state, batch = collected(
+        DelayedReward(), gae_lambda=gae_lambda, discount=0.5, normalize_advantages=False
+    )
+    after, metrics = jax.jit(algorithm.learn)(state, batch)
+    steps, nets = batch.transitions, networks.make_ppo_networks(DelayedReward(), config)
+    normalizer = networks.update_normalizer(state.normalizer, steps.observation)
+    obs = jnp.concatenate([steps.observation, steps.next_observation], axis=1)
+    values = np.asarray(nets.value_network.apply(normalizer, state.params.value, obs))
+    assert {0.0, 1.0} == set(np.asarray(steps.discount).ravel())
+    error = 2.0 * steps.reward + 0.5 * steps.discount * values[:, 1:] - values[:, :-1]
+    advantage, following = np.zeros_like(error), np.zeros(NUM_ENVS)
+    for t in reversed(range(STEPS)):
+        following = error[:, t] + 0.5 * gae_lambda * steps.discount[:, t] * following
+        advantage[:, t] = following
+    mean, std = map(np.asarray, nets.policy_network.apply(normalizer, state.params.policy, steps.observation))
+    action = np.asarray(steps.extras["policy_extras"]["raw_action"])
+    log_prob = (-0.5 * ((action - mean) / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi)).sum(axis=-1)
+    assert metrics["value_loss"] == pytest.approx(np.square(advantage).mean(), rel=1e-4)
+    assert metrics["policy_loss"] == pytest.approx(-(advantage * log_prob).mean(), rel=1e-3)
+    assert not np.array_equal(jax.tree.leaves(after.params)[0], jax.tree.leaves(state.params)[0])
+
+
+def test_correlated_noise_reaches_the_environment():
+    """The policy is held at 0, nearly without noise of its own, so that the last reward tells the noise."""
+    _, _, state, batch = collected(RewardedAction(), init_noise_std=1e-6, ou_noise_std=0.2)
+    assert state.noise.shape == (NUM_ENVS, 1) and np.asarray(state.noise).std() > 0.1
+    acted = jnp.clip(state.noise[:, 0], -1.0, 1.0)
+    np.testing.assert_allclose(batch.transitions.reward[:, -1], -jnp.square(acted - 0.5), atol=1e-2)
+
+
+def test_ornstein_uhlenbeck_statistics():
+    noise = OrnsteinUhlenbeck(std=0.1, theta=0.15)
+    path = np.asarray(noise.sequence(noise.init(256, 2), jax.random.PRNGKey(0), 400))[100:]
+    assert path.std() == pytest.approx(0.1 / np.sqrt(1 - 0.85**2), rel=0.05)
+    assert (path[1:] * path[:-1]).mean() / path.var() == pytest.approx(0.85, abs=0.01)
+
+
+@pytest.mark.parametrize("state_dependent", [False, True])
+def test_std_stays_within_its_bounds(state_dependent):
+    config = A2CConfig(min_log_std=-1.0, max_log_std=0.5, state_dependent_std=state_dependent, **GAUSSIAN)
+    nets = networks.make_ppo_networks(RewardedAction(), config)
+    for std, bounded in ((1e30, np.exp(0.5)), (1.2, 1.2), (0.0, np.exp(-1.0))):
+        parameters = (jnp.zeros((4096, 1)), jnp.full((4096, 1), std))
+        drawn = nets.parametric_action_distribution.sample(parameters, jax.random.PRNGKey(0))
+        assert np.asarray(drawn).std() == pytest.approx(bounded, rel=0.05)
+    _, std = nets.policy_network.apply(
+        networks.init_normalizer(1), nets.policy_network.init(jax.random.PRNGKey(0)), jnp.float32([[-3.0], [3.0]])
+    )
+    assert (float(std[0, 0]) != float(std[1, 0])) is state_dependent
