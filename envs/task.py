@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
+from mjx_walk.envs.rewards import RewardStep, Shaping, Terms, load_reward_function, shaping_terms, term_names
 from mjx_walk.errors import UserError
 from mjx_walk.settings import setting
 
@@ -53,6 +54,10 @@ class TaskOptions:
     reset_noise_scale: float = setting(1e-2, at_least=0)
     exclude_current_positions_from_observation: bool = True
     max_episode_steps: int = setting(1000, at_least=1)
+    shaping: Shaping = dataclasses.field(default_factory=Shaping)
+    """Terms to add to the reward."""
+    reward_function: str | None = None
+    """`PATH.py:FUNCTION`, a reward of your own instead of Gymnasium's; see `mjx_walk.envs.rewards`."""
 
     def __post_init__(self):
         for field in dataclasses.fields(self):  # a range comes as a list from a configuration file
@@ -74,6 +79,8 @@ class Task(abc.ABC):
     """Signed reward terms of each version, under the names of Gymnasium's `info`."""
     V5_ONLY: tuple[str, ...] = ("xml_file", "frame_skip")
     """Keywords that Gymnasium's v4 class does not take."""
+    HAS_Y: bool = True
+    """Whether `qpos[1]` is a way to the side."""
 
     def __init__(self, options: TaskOptions, physics: str = "auto"):
         """
@@ -82,8 +89,8 @@ class Task(abc.ABC):
             physics: engine name, or `auto`.
 
         Raises:
-            UserError: an unknown version or engine, a keyword that v4 does not take, or a model file that is not
-                there.
+            UserError: an unknown version or engine, a keyword that v4 does not take, or a model file or a reward
+                function that is not there or does not work.
         """
         if options.version not in self.XML_FILES:
             raise UserError(f"unknown version '{options.version}' of {options.name}; choose one of: v5, v4")
@@ -98,11 +105,14 @@ class Task(abc.ABC):
         low, high = self.model.actuator_ctrlrange.T
         self.action_low, self.action_high = jnp.float32(low), jnp.float32(high)
         self.action_size = self.model.nu
-        self.reward_terms = self.REWARD_TERMS[options.version]
-        self.metric_names = (*self.reward_terms, "nonfinite", "overflow")
         self.init_qpos = jnp.asarray(self.model.qpos0, jnp.float32)
         self.init_qvel = jnp.zeros(self.model.nv, jnp.float32)
         self.observation_size = sum(self.observation_blocks().values())
+        if options.shaping.keep_y and not self.HAS_Y:
+            raise UserError(f"env.shaping.keep_y={options.shaping.keep_y}: {options.name} has no y")
+        self._reward_function = load_reward_function(options.reward_function) if options.reward_function else None
+        self.reward_terms = self._reward_terms()
+        self.metric_names = (*self.reward_terms, "nonfinite", "overflow")
 
     @property
     def gymnasium_id(self) -> str:
@@ -112,7 +122,7 @@ class Task(abc.ABC):
     def gymnasium_kwargs(self) -> dict[str, Any]:
         """Keywords for `gymnasium.make` that give the same task; those at their default are left out."""
         defaults = type(self.options)()
-        not_theirs = {"name", "version", "max_episode_steps"}
+        not_theirs = {"name", "version", "max_episode_steps", "shaping", "reward_function"}
         kwargs = {
             field.name: getattr(self.options, field.name)
             for field in dataclasses.fields(self.options)
@@ -179,6 +189,25 @@ class Task(abc.ABC):
             metrics={name: jnp.zeros((), jnp.float32) for name in self.metric_names},
         )
 
+    def _own_reward(self, step: RewardStep) -> tuple[Terms, jax.Array]:
+        """All reward terms and the reward, with what the options add to Gymnasium's or put in its place."""
+        terms, reward = step.terms, step.reward
+        if self._reward_function:
+            terms = {name: jnp.float32(term) for name, term in self._reward_function(step).items()}
+            reward = sum(terms.values(), jnp.float32(0.0))
+        added = shaping_terms(self.options.shaping, step)
+        return terms | added, sum(added.values(), reward)
+
+    def _reward_terms(self) -> tuple[str, ...]:
+        terms = dict.fromkeys(self.REWARD_TERMS[self.options.version], jnp.float32(0.0))
+        physics = PhysicsState(self.init_qpos, self.init_qvel, self.init_qvel)
+        obs, action = jnp.zeros(self.observation_size), jnp.zeros(self.action_size)
+        step = RewardStep(terms, jnp.float32(0.0), physics, physics, obs, action, jnp.zeros((), bool), self.dt)
+        names = tuple(terms)
+        if self._reward_function:
+            names = term_names(self._reward_function, str(self.options.reward_function), step)
+        return (*names, *shaping_terms(self.options.shaping, step))
+
     def step(self, state: State, action: jax.Array) -> State:
         """One environment step of `frame_skip` physics steps.
 
@@ -195,6 +224,8 @@ class Task(abc.ABC):
         memory = self.remember(physics, derived)
         obs = self.observe(physics, derived)
         terms, reward, terminated = self.evaluate(state, physics, derived, memory, action)
+        rewarded = RewardStep(terms, reward, state.physics, physics, obs, action, terminated, self.dt)
+        terms, reward = self._own_reward(rewarded)
 
         is_sound = _is_sound((physics.qpos, physics.qvel)) & _is_sound((physics.qacc_warmstart, obs, reward), jnp.inf)
         physics, memory, obs = jax.tree.map(

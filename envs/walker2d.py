@@ -33,6 +33,7 @@ class Walker2d(Task):
 
     GYMNASIUM_NAME = "Walker2d"
     XML_FILES = {"v5": "walker2d_v5.xml", "v4": "walker2d.xml"}
+    HAS_Y = False
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_forward", "reward_ctrl", "reward_survive"))
 
     options: Walker2dOptions

@@ -10,7 +10,8 @@ _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR
 class Interrupt:
     """While entered, Ctrl-C, SIGTERM and SIGUSR1 only leave a note; a second Ctrl-C stops at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, doing: str = "finishing this chunk, then saving") -> None:
+        self._doing = doing
         self.signal_name: str | None = None
         self._previous: dict[signal.Signals, object] = {}
 
@@ -28,7 +29,7 @@ class Interrupt:
         if self.signal_name and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.signal_name = signal.Signals(number).name
-        print(f"\n{self.signal_name}: finishing this chunk, then saving", file=sys.stderr, flush=True)
+        print(f"\n{self.signal_name}: {self._doing}", file=sys.stderr, flush=True)
 
 
 def exit_code(signal_name: str) -> int:

@@ -15,6 +15,7 @@ from brax.training.distribution import NormalDistribution, NormalTanhDistributio
 from brax.training.networks import ACTIVATION
 
 from mjx_walk.envs import Task
+from mjx_walk.errors import UserError
 
 MIN_OBSERVATION_STD = 1e-4
 """Observations that hardly vary (a body's mass) are not blown up beyond this."""
@@ -28,6 +29,9 @@ def make_ppo_networks(task: Task, config: Any) -> ppo_networks.PPONetworks:
         config: with `policy_hidden_layer_sizes`, `value_hidden_layer_sizes`, `activation`, `distribution`
             (`tanh_normal`: state-dependent std, squashed; `normal`: unbounded, std dependent or not),
             `init_noise_std`, `state_dependent_std`, `min_log_std`, `max_log_std` and `observation_clip`.
+
+    Raises:
+        UserError: the bounds of the std exclude each other.
     """
     normal_only: dict[str, Any] = {}
     if config.distribution == "normal":
@@ -48,6 +52,8 @@ def make_ppo_networks(task: Task, config: Any) -> ppo_networks.PPONetworks:
         **normal_only,
     )
     if config.distribution == "normal":
+        if config.min_log_std > config.max_log_std:
+            raise UserError(f"algo.min_log_std={config.min_log_std} is above algo.max_log_std={config.max_log_std}")
         nets = nets.replace(parametric_action_distribution=_BoundedNormal(task.action_size, config))
     return nets
 

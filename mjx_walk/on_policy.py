@@ -62,8 +62,9 @@ class OnPolicyConfig:
     init_noise_std: float = setting(1.0, above=0)
     """Of a std that does not depend on the state."""
     state_dependent_std: bool = False
-    min_log_std: float = setting(-20.0, at_most=0)
-    max_log_std: float = setting(2.0, at_least=0)
+    min_log_std: float = -20.0
+    max_log_std: float = 2.0
+    """The same as `min_log_std` for a std that does not learn."""
     stagger_episodes: bool = True
 
 

@@ -35,15 +35,17 @@ TINY_CHUNK = 8 * 8
 """Environment steps of a chunk of either."""
 
 
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
+
+
 def command(module: str, *arguments: str, **kwargs) -> subprocess.CompletedProcess:
     """`python -m mjx_walk.MODULE ARGUMENTS`, in a process of its own."""
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent), **kwargs.pop("env", {})}
     return subprocess.run(
         [sys.executable, "-m", f"mjx_walk.{module}", *arguments],
         capture_output=True,
         text=True,
         timeout=kwargs.pop("timeout", 600),
-        env=environment,
+        env=ENVIRONMENT | kwargs.pop("env", {}),
         check=False,
         **kwargs,
     )

@@ -33,9 +33,17 @@ def test_there_is_a_recipe_for_every_task_on_every_hardware():
 @pytest.mark.parametrize("name", sorted(path.stem for path in Path(CONFIG_DIR).glob("recipe/report/*.yaml")))
 def test_the_reports_recipes_name_their_own_task_and_algorithm(name):
     config = load_config([f"recipe=report/{name}"])
-    assert config.algo.name == name.partition("_")[2] and config.evaluation.num_envs == 10
+    report, algo = name.split("_")[:2]
+    task = {"a": "humanoid", "b": "humanoid", "c": "humanoid", "d": "humanoid_standup", "e": "walker2d"}[report]
+    assert (config.algo.name, config.env.name) == (algo, task) and config.env.version == (
+        "v5" if report == "e" else "v4"
+    )
     algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
-    assert algorithm.steps_per_update == config.num_envs
+    assert algorithm.steps_per_update * config.updates_per_chunk < config.total_steps / 20
+
+
+def test_the_first_reports_observation_has_378_numbers():
+    assert make_task(load_config(["recipe=report/a_a2c"])).observation_size == 378
 
 
 def test_without_an_accelerator_the_small_recipe_is_chosen():

@@ -45,6 +45,7 @@ SETTINGS = {
         "value_hidden_layer_sizes": (32, 32),
         "unroll_length": 8,
         "learning_rate": 1e-2,
+        "init_noise_std": 0.3,
         "normalize_advantages": False,
         "entropy_cost": 1e-3,
     },

@@ -26,6 +26,8 @@ class A2CConfig(OnPolicyConfig):
     """Settings of A2C; the recipe of each task changes some of them."""
 
     name: str = setting("a2c", choices=("a2c",))
+    distribution: str = setting("normal", choices=("tanh_normal", "normal"))
+    """Squashed, it runs away: nothing holds the mean back where tanh is flat."""
     num_unrolls: int = setting(1, at_least=1)
     num_minibatches: int = setting(1, at_least=1)
     """Gradient steps on a batch, each on pieces of its own."""

@@ -26,6 +26,8 @@ class REINFORCEConfig(OnPolicyConfig):
     here."""
 
     name: str = setting("reinforce", choices=("reinforce",))
+    distribution: str = setting("normal", choices=("tanh_normal", "normal"))
+    """Squashed, it runs away: nothing holds the mean back where tanh is flat."""
     unroll_length: int = setting(256, at_least=1)
     num_unrolls: int = setting(1, at_least=1)
     num_minibatches: int = setting(1, at_least=1)

@@ -1,0 +1,97 @@
+"""`python -m mjx_walk.compare env=humanoid 'algos=[ppo,sac]' seeds=3`: algorithms and settings side by side."""
+
+import dataclasses
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from mjx_walk import cells, cli
+from mjx_walk.algos import ALGORITHMS
+from mjx_walk.comparison import write_report
+from mjx_walk.errors import UserError
+from mjx_walk.interrupt import exit_code
+from mjx_walk.settings import setting
+
+USAGE = """
+usage: python -m mjx_walk.compare [env=ENV] ['algos=[ppo,sac,td3]'] [seeds=3] [out=DIR] [KEY=VALUE ...]
+
+  algos=[…]            algorithms, each with its recipe for the environment; all of them unless said otherwise
+  seeds=N or [3,7]     the seeds 0 to N-1, or these
+  KEY=VALUE            as for train, for all runs: env=walker2d total_steps=1e6
+  KEY=A,B,C            a variant for each value: algo.learning_rate=1e-3,3e-4
+  out=DIR              by default runs/compare_ENV; what is finished there is kept, what was interrupted goes on
+  devices=N            GPUs to use, a run on each; by default all
+  per_device=N         runs that share a GPU
+  draw=true            only draw what is below out=DIR, from wherever it came
+
+It writes comparison.png, comparison.md and comparison.csv into out=DIR whenever a run ends.
+"""
+
+
+@dataclasses.dataclass
+class Arguments:
+    algos: tuple[str, ...] = setting(tuple(ALGORITHMS), choices=tuple(ALGORITHMS))
+    seeds: Any = 3
+    out: str | None = None
+    devices: int | None = setting(None, at_least=1)
+    per_device: int = setting(1, at_least=1)
+    draw: bool = False
+
+
+def main(arguments: list[str]) -> int:
+    """Run the cells that are not finished, and draw. Returns the exit code."""
+    own_keys = [field.name for field in dataclasses.fields(Arguments)]
+    is_own = [argument.partition("=")[0] in own_keys or argument in ("-h", "--help") for argument in arguments]
+    own = cli.parse(Arguments, [a for a, mine in zip(arguments, is_own, strict=True) if mine], USAGE)
+    overrides = [a for a, mine in zip(arguments, is_own, strict=True) if not mine]
+    env = next((o.partition("=")[2] for o in overrides if o.startswith("env=")), "humanoid")
+    out = Path(own.out or f"runs/compare_{env}")
+    if own.draw:
+        _report(out)
+        return 0
+    if not own.algos:
+        raise UserError(f"algos=[]: choose some of: {', '.join(ALGORITHMS)}")
+    seeds = _seeds(own.seeds)
+    hardware, available = cells.count_devices()
+    count = own.devices or available
+    if count > available:
+        raise UserError(f"devices={count}: this machine has {available}")
+    planned = cells.plan(overrides, list(own.algos), seeds, out, hardware)
+    open_cells = [cell for cell in planned if not cell.is_finished]
+    print(f"{len(planned)} runs, {len(planned) - len(open_cells)} of them finished before, in {out}", flush=True)
+
+    def on_end(cell: cells.Cell) -> None:
+        if cell.is_finished:
+            print(f"{cell.name}: finished", flush=True)
+            write_report(out)
+        else:
+            print(f"{cell.name}: not finished; see {out}/logs/{cell.name}.txt", flush=True)
+
+    slots: list[int | None] = list(range(count)) if hardware == "gpu" else [None]
+    signal_name = cells.run(open_cells, slots * own.per_device, out / "logs", on_end)
+    if signal_name:
+        print(f"Stopped by {signal_name}; the same command goes on.")
+        return exit_code(signal_name)
+    _report(out)
+    failed = [cell.name for cell in planned if not cell.is_finished]
+    if failed:
+        print(f"not finished: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _report(out: Path) -> None:
+    report = write_report(out)
+    print(report.read_text(), end="")
+    print(f"{os.path.relpath(report)}, and .png and .csv beside it")
+
+
+def _seeds(value: Any) -> list[int]:
+    seeds = list(range(value)) if type(value) is int else value
+    if isinstance(seeds, list) and seeds and all(type(seed) is int and seed >= 0 for seed in seeds):
+        return seeds
+    raise UserError(f"seeds={value}: give a number of seeds, or a list of seeds from 0 up")
+
+
+if __name__ == "__main__":
+    cli.main(main)

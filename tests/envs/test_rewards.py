@@ -1,0 +1,120 @@
+"""Rewards beyond Gymnasium's: each added term from its definition, and a function of one's own."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_walk import api
+from mjx_walk.envs import make_env
+from mjx_walk.envs.rewards import Shaping
+from mjx_walk.errors import UserError
+
+OWN_REWARD = """
+import jax.numpy as jnp
+
+def upright(step):
+    height = step.after.qpos[1]
+    return {"reward_height": 2.0 * height, "reward_forward": step.terms["reward_forward"]}
+
+def broken(step):
+    return step.after.qpos[99] + missing
+
+def vector(step):
+    return {"reward_all": step.after.qpos}
+"""
+
+
+@pytest.fixture
+def own(tmp_path):
+    path = tmp_path / "my_reward.py"
+    path.write_text(OWN_REWARD)
+    return path
+
+
+def step(task, qpos_change, qvel, action=0.3):
+    """One step from the model's pose, changed, and the same of Gymnasium's task alone."""
+    qpos = task.init_qpos + jnp.zeros_like(task.init_qpos).at[jnp.array(list(qpos_change))].set(
+        jnp.array(list(qpos_change.values()))
+    )
+    before = task.reset_to(qpos, jnp.full(task.init_qvel.shape, qvel))
+    return before, jax.jit(task.step)(before, jnp.full(task.action_size, action))
+
+
+def test_each_term_follows_from_its_definition():
+    weights = {"keep_y": 2.0, "shaking": 0.5, "falling": 7.0, "backward": 3.0}
+    plain = make_env("humanoid", physics="c")
+    shaped = make_env("humanoid", physics="c", shaping=Shaping(**weights))
+    assert shaped.reward_terms[-4:] == ("reward_keep_y", "reward_shaking", "reward_falling", "reward_backward")
+    assert shaped.gymnasium_kwargs() == {}
+    fell = 0
+    for change, speed in (({1: 0.8}, 0.5), ({1: -1.2}, -2.0), ({2: -0.7}, -0.1)):
+        before, after = step(shaped, change, speed)
+        _, gymnasiums = step(plain, change, speed)
+        qpos, qvel = np.asarray(after.physics.qpos), np.asarray(after.physics.qvel)
+        moved = (qpos[0] - float(before.physics.qpos[0])) / plain.dt
+        fell += int(after.terminated)
+        expected = {
+            "reward_keep_y": 2.0 * np.exp(-(qpos[1] ** 2)),
+            "reward_shaking": -0.5 * np.mean(qvel[6:] ** 2),
+            "reward_falling": -7.0 * float(after.terminated),
+            "reward_backward": 3.0 * min(moved, 0.0),
+        }
+        for name, value in expected.items():
+            assert float(after.metrics[name]) == pytest.approx(value, rel=1e-4, abs=1e-4), name
+        assert float(after.reward) == pytest.approx(float(gymnasiums.reward) + sum(expected.values()), rel=1e-4)
+        np.testing.assert_array_equal(after.obs, gymnasiums.obs)
+    assert fell == 1
+
+
+def test_a_weight_of_zero_leaves_gymnasiums_reward_as_it_is():
+    assert make_env("walker2d", physics="c").reward_terms == ("reward_forward", "reward_ctrl", "reward_survive")
+
+
+def test_own_reward_takes_the_place_of_gymnasiums(own):
+    task = make_env("walker2d", physics="c", reward_function=f"{own}:upright", shaping=Shaping(shaking=0.1))
+    assert set(task.reward_terms) == {"reward_height", "reward_forward", "reward_shaking"}
+    _, after = step(task, {1: 0.2}, 0.3)
+    assert float(after.metrics["reward_height"]) == pytest.approx(2.0 * float(after.physics.qpos[1]), rel=1e-6)
+    assert float(after.reward) == pytest.approx(sum(float(after.metrics[name]) for name in task.reward_terms), rel=1e-5)
+
+
+def test_training_with_an_own_reward_is_scored_by_gymnasium(own, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = api.run(
+        [
+            *("env=walker2d", "env.reward_function=my_reward.py:upright", "env.shaping.falling=5", "run_dir=run"),
+            *("num_envs=8", "total_steps=512", "algo.unroll_length=32", "algo.num_minibatches=2"),
+            *("evaluation.num_envs=2", "evaluation.gymnasium_episodes=1"),
+        ]
+    )
+    row = run.metrics[-1]
+    assert row["episode/reward_height"] > 0 and row["episode/reward_falling"] == -5.0
+    assert row["episode/return"] == pytest.approx(
+        row["episode/reward_height"] + row["episode/reward_forward"] + row["episode/reward_falling"], rel=1e-4
+    )
+    assert json.loads((tmp_path / "run" / "eval_gymnasium.json").read_text())["env"] == "Walker2d-v5"
+
+
+@pytest.mark.parametrize(
+    ("function", "says"),
+    [
+        ("nowhere.py:f", "no file 'nowhere.py'; write PATH.py:FUNCTION"),
+        ("upright", "write PATH.py:FUNCTION"),
+        ("my_reward.py:missing", "has no function 'missing'"),
+        ("my_reward.py:broken", "NameError: name 'missing' is not defined"),
+        ("my_reward.py:vector", "must return a dict of scalars by name"),
+    ],
+)
+def test_a_reward_function_that_does_not_work(own, tmp_path, monkeypatch, function, says):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError) as error:
+        make_env("walker2d", physics="c", reward_function=function)
+    assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_no_y_in_a_plane():
+    with pytest.raises(UserError, match="walker2d has no y"):
+        make_env("walker2d", physics="c", shaping=Shaping(keep_y=1.0))

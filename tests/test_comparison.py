@@ -1,0 +1,175 @@
+"""Comparing: what is planned, what is kept, what is drawn."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from commands import ENVIRONMENT, command
+
+from mjx_walk import cells, comparison
+from mjx_walk import compare as compare_command
+from mjx_walk.config import load_config, save_config
+from mjx_walk.errors import UserError
+
+SMALL = (
+    *("env=walker2d", "num_envs=8", "algo.unroll_length=8", "algo.num_minibatches=2"),
+    *("total_steps=512", "evaluation.num_envs=2", "evaluation.gymnasium_episodes=1", "updates_per_chunk=1"),
+)
+
+
+def fake_run(folder, overrides, returns, score=None):
+    """A run folder whose return rises along `returns`, one row a million steps and ten seconds."""
+    folder.mkdir(parents=True)
+    config = load_config([*overrides, f"run_dir='{folder}'"])
+    save_config(config, folder / "config.yaml")
+    rows = [
+        {"env_steps": 1e6 * i, "wall_seconds": 10.0 * i, "episode/return": value, "episode/length": 10 * value}
+        for i, value in enumerate(returns, start=1)
+    ]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    if score is not None:
+        content = json.dumps({"mean": score, "std": 1.0, "returns": [score]})
+        (folder / "eval_gymnasium.json").write_text(content)
+
+
+def test_variants_are_the_product_of_algorithms_swept_values_and_seeds(tmp_path):
+    overrides = ["env=walker2d", "algo.discount=0.9,0.95", "total_steps=1000"]
+    planned = cells.plan(overrides, ["ppo", "a2c"], [0, 7], tmp_path / "a b's", "cpu")
+    assert [cell.name for cell in planned] == [
+        f"{algo},algo.discount={discount}/seed_{seed}"
+        for seed in (0, 7)
+        for algo in ("ppo", "a2c")
+        for discount in ("0.9", "0.95")
+    ]
+    last = planned[-1].config
+    assert (last.algo.name, last.algo.discount, last.seed, last.total_steps) == ("a2c", 0.95, 7, 1000)
+    assert last.run_dir == str(tmp_path / "a b's" / "a2c,algo.discount=0.95" / "seed_7")
+    assert planned[0].config.num_envs == 128 and planned[1].config.num_envs == 128  # each with its own recipe
+    assert planned[2].config.algo.name == "a2c" and planned[2].config.num_envs == 64
+
+
+def test_runs_are_grouped_by_what_sets_them_apart(tmp_path):
+    for seed, score in ((0, 10.0), (1, 20.0)):
+        fake_run(tmp_path / f"x{seed}", ["env=walker2d", f"seed={seed}"], [1, 2, 3], score)
+        fake_run(tmp_path / "sweep" / str(seed), ["env=walker2d", f"seed={seed}", "algo.discount=0.5"], [0, 1])
+    fake_run(tmp_path / "other", ["env=walker2d", "algo=a2c"], [5])
+    groups = comparison.group(comparison.read_runs(tmp_path))
+    assert {label: len(runs) for label, runs in groups.items()} == {
+        "a2c": 1,
+        "ppo, discount=0.99": 2,
+        "ppo, discount=0.5": 2,
+    }
+    text = comparison.write_report(tmp_path).read_text()
+    assert "| ppo, discount=0.99 | 2 | 15 | 7 | – | 10 | 3.00 | 30 |" in text
+    assert "| ppo, discount=0.5 | 0 of 2 scored | – | – | – | – | 2.00 | 20 |" in text
+    rows = list(csv.DictReader((tmp_path / "comparison.csv").open()))
+    assert len(rows) == 5 and {row["gymnasium_mean"] for row in rows} == {"10.0", "20.0", ""}
+    assert (tmp_path / "comparison.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_runs_of_different_environments_do_not_mix(tmp_path):
+    fake_run(tmp_path / "a", ["env=walker2d"], [1])
+    fake_run(tmp_path / "b", ["env=humanoid"], [1])
+    with pytest.raises(UserError, match="humanoid v5, walker2d v5"):
+        comparison.read_runs(tmp_path)
+
+
+def test_mean_curve_is_drawn_where_all_seeds_are():
+    x, mean, values = comparison.mean_curve(
+        [(np.array([0.0, 4.0]), np.array([0.0, 8.0])), (np.array([2.0, 6.0]), np.array([1.0, 1.0]))]
+    )
+    assert (x[0], x[-1]) == (2.0, 4.0) and values.shape == (2, len(x))
+    np.testing.assert_allclose(mean, (2.0 * x + 1.0) / 2.0)
+    apart = comparison.mean_curve([(np.array([0.0, 1.0]), np.ones(2)), (np.array([2.0, 3.0]), np.ones(2))])
+    assert apart[0].size == 0
+
+
+def test_intervals_from_five_seeds_up():
+    assert comparison.interval(np.arange(4.0)) is None
+    values = np.random.default_rng(0).normal(10.0, 2.0, (40, 3))
+    low, high = comparison.interval(values)
+    # Near the interval of a normal mean: ± 1.96 · 2 / √40 = ± 0.62.
+    assert low.shape == (3,)
+    np.testing.assert_allclose(values.mean(0) - low, 0.62, atol=0.15)
+    np.testing.assert_allclose(high - values.mean(0), 0.62, atol=0.15)
+
+
+def test_compare_runs_what_is_missing_and_keeps_the_rest(tmp_path):
+    arguments = ("algos=[ppo,a2c]", "seeds=1", "out=out", *SMALL)
+    done = command("compare", *arguments, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "2 runs, 0 of them finished before" in done.stdout and "| a2c | 1 |" in done.stdout
+    before = (tmp_path / "out" / "ppo" / "seed_0" / "metrics.jsonl").stat().st_mtime_ns
+    again = command("compare", *arguments[:2], "seeds=2", *arguments[2:], cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert "4 runs, 2 of them finished before" in again.stdout and "| a2c | 2 |" in again.stdout
+    assert (tmp_path / "out" / "ppo" / "seed_0" / "metrics.jsonl").stat().st_mtime_ns == before
+
+
+def test_an_interrupted_comparison_goes_on(tmp_path):
+    arguments = ["algos=[a2c]", "seeds=1", "out=out", *SMALL, "checkpoint.every_chunks=1"]
+    arguments[arguments.index("total_steps=512")] = "total_steps=20000"
+    full = [sys.executable, "-m", "mjx_walk.compare", *arguments]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(full, cwd=tmp_path, env=ENVIRONMENT, **pipes)
+    run = tmp_path / "out" / "a2c" / "seed_0"
+    deadline = time.monotonic() + 120
+    while not list(run.glob("checkpoints/0*")):
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 130 and "the same command goes on" in out
+    steps = len((run / "metrics.jsonl").read_text().splitlines())
+    assert 0 < steps < 20000 / 64
+    done = command("compare", *arguments, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = [json.loads(line)["env_steps"] for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert rows == [64 * i for i in range(1, len(rows) + 1)] and rows[-1] >= 20000
+
+
+BAD = [
+    (["algos=[dqn]"], "algos=['dqn']: choose one of: ppo"),
+    (["algos=[]"], "algos=[]: choose some of: ppo"),
+    (["seeds=0"], "seeds=0: give a number of seeds, or a list of seeds from 0 up"),
+    (["seeds=[a]"], "give a number of seeds"),
+    (["algo=ppo"], "'algo=ppo': in a comparison write algos=[…]"),
+    (["seed=1"], "write seeds=N"),
+    (["devices=99"], "devices=99: this machine has"),
+    (["per_device=0"], "per_device=0: must be at least 1"),
+    (["env=ant"], "unknown env 'ant'"),
+    (["algo.discount=0.9,2.0"], "algo.discount=2.0: must be at most 1"),
+    (["draw=true", "out=nowhere"], "no runs below 'nowhere'"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "says"), BAD, ids=[" ".join(case[0]) for case in BAD])
+def test_compare_names_the_mistake(arguments, says, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cells, "count_devices", lambda: ("cpu", 1))
+    with pytest.raises(UserError) as error:
+        compare_command.main(arguments)
+    assert says in str(error.value) and "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_with_other_settings_is_left_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cells, "count_devices", lambda: ("cpu", 1))
+    fake_run(tmp_path / "out" / "ppo" / "seed_0", ["env=walker2d", "num_envs=128"], [1])
+    with pytest.raises(UserError, match="holds a run with other settings \\(num_envs\\); choose another out=DIR"):
+        compare_command.main(["env=walker2d", "algos=[ppo]", "out=out", "num_envs=256"])
+
+
+@pytest.mark.slow
+def test_runs_spread_by_hydras_joblib_launcher_are_drawn(tmp_path):
+    arguments = ["seed=0,1", "hydra/launcher=joblib", "hydra.sweep.dir=out", *SMALL]
+    done = command("train", "-m", *arguments, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    drawn = command("compare", "draw=true", "out=out", cwd=tmp_path)
+    assert drawn.returncode == 0 and "| ppo | 2 |" in drawn.stdout, drawn.stderr
