@@ -173,3 +173,18 @@ def test_runs_spread_by_hydras_joblib_launcher_are_drawn(tmp_path):
     assert done.returncode == 0, done.stderr
     drawn = command("compare", "draw=true", "out=out", cwd=tmp_path)
     assert drawn.returncode == 0 and "| ppo | 2 |" in drawn.stdout, drawn.stderr
+
+
+@pytest.mark.parametrize(("visible", "expected"), [(None, "1"), ("4,6", "6")])
+def test_each_run_sees_its_own_gpu(tmp_path, monkeypatch, visible, expected):
+    """Counted among those that the user lets us see."""
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if visible:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    started = []
+    monkeypatch.setattr(subprocess, "Popen", lambda arguments, **kwargs: started.append((arguments, kwargs["env"])))
+    (cell,) = cells.plan(["env=walker2d"], ["ppo"], [3], tmp_path, "gpu")
+    cells.start(cell, tmp_path / "logs" / "cell.txt", 1)
+    ((arguments, environment),) = started
+    assert environment["CUDA_VISIBLE_DEVICES"] == expected
+    assert "seed=3" in arguments and "resume=true" not in arguments
