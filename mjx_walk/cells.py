@@ -29,7 +29,7 @@ class Cell:
     """One run of a comparison."""
 
     variant: str
-    """What sets it apart from the others, as a folder name: `ppo`, `ppo,algo.learning_rate=0.001`."""
+    """What sets it apart from the others, as a folder name: `ppo`, `ppo_learning_rate-0.001`."""
     overrides: tuple[str, ...]
     config: Config
 
@@ -82,17 +82,21 @@ def plan(overrides: list[str], algos: list[str], seeds: list[int], out: Path, ha
             choices.append([f"{override.key_or_group}={value}" for value in values])
         else:
             choices.append([str(override.input_line)])
-    cells = []
+    cells: dict[str, Cell] = {}
     for seed, chosen in itertools.product(seeds, itertools.product(*choices)):
         swept = [text for text, options in zip(chosen[1:], choices[1:], strict=True) if len(options) > 1]
-        variant = re.sub(r"[^\w.,=+-]+", "-", ",".join([chosen[0].removeprefix("algo="), *swept]))
+        # No "=" and no ",", which would mean something to Hydra where the folder is named to it again.
+        parts = [re.sub(r"[^\w.+]+", "-", text.removeprefix("algo").lstrip("=.")) for text in (chosen[0], *swept)]
+        variant = "_".join(parts)
         run_dir = out / variant / f"seed_{seed}"
         quoted = str(run_dir).replace("\\", "\\\\").replace("'", "\\'")
         arguments = (*chosen, f"seed={seed}", f"run_dir='{quoted}'")
-        cells.append(Cell(variant, arguments, load_config(list(arguments))))
-    for cell in cells:
+        cell = Cell(variant, arguments, load_config(list(arguments)))
+        if cells.setdefault(cell.name, cell).config != cell.config:
+            raise UserError(f"two variants would share the folder {run_dir}; compare them in two comparisons")
+    for cell in cells.values():
         _check_same_configuration(cell)
-    return cells
+    return list(cells.values())
 
 
 def start(cell: Cell, log: Path, device: int | None) -> subprocess.Popen:

@@ -41,16 +41,27 @@ def test_variants_are_the_product_of_algorithms_swept_values_and_seeds(tmp_path)
     overrides = ["env=walker2d", "algo.discount=0.9,0.95", "total_steps=1000"]
     planned = cells.plan(overrides, ["ppo", "a2c"], [0, 7], tmp_path / "a b's", "cpu")
     assert [cell.name for cell in planned] == [
-        f"{algo},algo.discount={discount}/seed_{seed}"
+        f"{algo}_discount-{discount}/seed_{seed}"
         for seed in (0, 7)
         for algo in ("ppo", "a2c")
         for discount in ("0.9", "0.95")
     ]
     last = planned[-1].config
     assert (last.algo.name, last.algo.discount, last.seed, last.total_steps) == ("a2c", 0.95, 7, 1000)
-    assert last.run_dir == str(tmp_path / "a b's" / "a2c,algo.discount=0.95" / "seed_7")
+    assert last.run_dir == str(tmp_path / "a b's" / "a2c_discount-0.95" / "seed_7")
     assert planned[0].config.num_envs == 128 and planned[1].config.num_envs == 128  # each with its own recipe
     assert planned[2].config.algo.name == "a2c" and planned[2].config.num_envs == 64
+
+
+def test_what_is_named_twice_is_run_once(tmp_path):
+    assert len(cells.plan(["env=walker2d"], ["ppo", "ppo"], [0, 0, 1], tmp_path, "cpu")) == 2
+    layers = ["env=walker2d", "algo.policy_hidden_layer_sizes=[32,32],[32,64]"]
+    assert [c.variant for c in cells.plan(layers, ["ppo"], [0], tmp_path, "cpu")] == [
+        "ppo_policy_hidden_layer_sizes-32-32-",
+        "ppo_policy_hidden_layer_sizes-32-64-",
+    ]
+    with pytest.raises(UserError, match="would share the folder"):
+        cells.plan(["env=walker2d", "env.xml_file=a-b,a:b"], ["ppo"], [0], tmp_path, "cpu")
 
 
 def test_runs_are_grouped_by_what_sets_them_apart(tmp_path):
