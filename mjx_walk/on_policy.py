@@ -35,8 +35,9 @@ class OnPolicyConfig:
     num_unrolls: int = setting(4, at_least=1)
     """Pieces of every copy in one batch."""
     learning_rate: float = setting(3e-4, above=0)
-    learning_rate_schedule: str = setting("constant", choices=("constant", "linear"))
-    """`linear`: to zero over `schedule_steps`."""
+    learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
+    """`linear`: to zero over `schedule_steps`; `adaptive_kl`: kept near `target_kl`, and annealed as well."""
+    target_kl: float = setting(0.01, above=0)
     schedule_steps: int = setting(100_000_000, at_least=1)
     """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
     max_policy_grad_norm: float = setting(1.0, above=0)

@@ -11,7 +11,7 @@ from brax.training.acme.running_statistics import RunningStatisticsState
 from mjx_walk import networks
 from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyGround, OnPolicyState
 from mjx_walk.optimizers import descend
-from mjx_walk.schedules import factor
+from mjx_walk.schedules import adapt_rate, factor
 from mjx_walk.types import Metrics
 
 
@@ -33,32 +33,52 @@ def learn_once(
         batch: as collected.
         data: what the loss reads of it; a tree of `[N, …]`.
         num_minibatches: gradient steps.
-        loss: `(params, normalizer, data of a minibatch, entropy cost, key)` to `(loss, metrics)`.
+        loss: `(params, normalizer, data of a minibatch, entropy cost, key)` to `(loss, metrics)`, among them `kl`.
 
     Returns:
         The state after it, and all metrics.
     """
     key, shuffle_key, loss_key = jax.random.split(state.key, 3)
     remaining = ground.remaining(state)
-    rate = state.learning_rate * factor(config.learning_rate_schedule, remaining)
+    is_adaptive = config.learning_rate_schedule == "adaptive_kl"
+    rate_factor = factor(config.learning_rate_schedule, remaining)
     entropy_cost = config.entropy_cost * factor(config.entropy_schedule, remaining)
-    normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
+    # The policy that acted had the old normalizer, which its KL is to be measured under.
+    new_normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
+    normalizer = state.normalizer if is_adaptive else new_normalizer
 
     def minibatch(carry, inputs):
-        params, opt_state = carry
+        params, opt_state, rate = carry
         rows, key = inputs
         part = jax.tree.map(lambda x: x[rows], data)
         grads, metrics = jax.grad(loss, has_aux=True)(params, normalizer, part, entropy_cost, key)
         metrics |= {"grad_norm": optax.global_norm(grads)}
-        return descend(ground.optimizer, params, grads, opt_state, rate), metrics
+        if is_adaptive:
+            rate = adapt_rate(rate, metrics["kl"], config.target_kl)
+        return (*descend(ground.optimizer, params, grads, opt_state, rate * rate_factor), rate), metrics
 
     rows = jax.random.permutation(shuffle_key, batch.transitions.reward.shape[0]).reshape((num_minibatches, -1))
     keys = jax.random.split(loss_key, num_minibatches)
-    (params, opt_state), metrics = jax.lax.scan(minibatch, (state.params, state.optimizer), (rows, keys))
+    carry = (state.params, state.optimizer, state.learning_rate)
+    (params, opt_state, rate), metrics = jax.lax.scan(minibatch, carry, (rows, keys))
     new_state = state.replace(
-        params=params, optimizer=opt_state, normalizer=normalizer, key=key, updates=state.updates + 1
+        params=params,
+        optimizer=opt_state,
+        learning_rate=rate,
+        normalizer=new_normalizer,
+        key=key,
+        updates=state.updates + 1,
     )
     return new_state, batch.stats | jax.tree.map(jnp.mean, metrics) | {
-        "learning_rate": jnp.float32(rate),
+        "learning_rate": jnp.float32(rate * rate_factor),
         "reward_scale": batch.reward_scale,
     }
+
+
+def sampled_kl(log_prob: jax.Array, acted_log_prob: jax.Array) -> jax.Array:
+    """KL of the policy from the one that acted, from the latter's own draws: `r - 1 - log r`, never below zero.
+
+    Source: Schulman 2020, "Approximating KL divergence", the third estimator.
+    """
+    log_ratio = jnp.minimum(log_prob - acted_log_prob, 10.0)
+    return (jnp.exp(log_ratio) - 1.0 - log_ratio).mean()

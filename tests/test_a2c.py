@@ -10,6 +10,7 @@ from mjx_walk import networks
 from mjx_walk.algos.a2c import A2CConfig, make_a2c
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.noise import OrnsteinUhlenbeck
+from mjx_walk.policy_gradient import sampled_kl
 
 NUM_ENVS, STEPS = 16, 6
 GAUSSIAN = {"distribution": "normal", "policy_hidden_layer_sizes": (8,), "value_hidden_layer_sizes": (8,)}
@@ -75,3 +76,22 @@ def test_std_stays_within_its_bounds(state_dependent):
         networks.init_normalizer(1), nets.policy_network.init(jax.random.PRNGKey(0)), jnp.float32([[-3.0], [3.0]])
     )
     assert (float(std[0, 0]) != float(std[1, 0])) is state_dependent
+
+
+def test_sampled_kl_is_that_of_two_gaussians():
+    """KL(N(0, 1) ‖ N(0.3, 1)) = 0.3² / 2, from draws of the first."""
+    drawn = jax.random.normal(jax.random.PRNGKey(0), (200_000,))
+    acted, learned = -0.5 * drawn**2, -0.5 * (drawn - 0.3) ** 2
+    assert float(sampled_kl(learned, acted)) == pytest.approx(0.045, rel=0.02)
+    assert float(sampled_kl(acted, acted)) == 0.0
+
+
+def test_adaptive_rate_falls_where_the_policy_moves_too_fast():
+    settings = {"learning_rate_schedule": "adaptive_kl", "num_minibatches": 8, "learning_rate": 1e-2}
+    _, algorithm, state, batch = collected(RewardedAction(), target_kl=1e-5, **settings)
+    after, metrics = jax.jit(algorithm.learn)(state, batch)
+    # The first minibatch is still at the policy that acted: no KL, so no change; after that it falls each time.
+    assert float(after.learning_rate) == pytest.approx(1e-2 / 1.5**7, rel=1e-5) and metrics["kl"] > 2e-5
+    _, algorithm, state, batch = collected(RewardedAction(), target_kl=10.0, **settings | {"learning_rate": 1e-4})
+    after, _ = jax.jit(algorithm.learn)(state, batch)
+    assert float(after.learning_rate) == pytest.approx(1e-4 * 1.5**7, rel=1e-5)

@@ -16,7 +16,7 @@ from mjx_walk.on_policy import (
     make_on_policy,
     require_whole_minibatches,
 )
-from mjx_walk.policy_gradient import learn_once
+from mjx_walk.policy_gradient import learn_once, sampled_kl
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -79,7 +79,8 @@ def make_a2c(task: Task, num_envs: int, evaluation: EvaluationConfig, config: A2
         policy_loss = -(advantages * log_prob).mean()
         value_loss = jnp.square(targets - values).mean()
         total = policy_loss + config.value_cost * value_loss - entropy_cost * entropy
-        return total, {"loss": total, "policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
+        metrics = {"loss": total, "policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
+        return total, metrics | {"kl": sampled_kl(log_prob, data.extras["policy_extras"]["log_prob"])}
 
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         data = batch.transitions._replace(reward=batch.transitions.reward * batch.reward_scale)

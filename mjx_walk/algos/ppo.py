@@ -13,7 +13,7 @@ from mjx_walk.envs import Task
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy, require_whole_minibatches
 from mjx_walk.optimizers import descend
-from mjx_walk.schedules import factor
+from mjx_walk.schedules import adapt_rate, factor
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -25,9 +25,6 @@ class PPOConfig(OnPolicyConfig):
     name: str = setting("ppo", choices=("ppo",))
     num_minibatches: int = setting(32, at_least=1)
     num_epochs: int = setting(8, at_least=1)
-    learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
-    """`linear`: to zero over `schedule_steps`; `adaptive_kl`: kept near `target_kl`, and annealed as well."""
-    target_kl: float = setting(0.01, above=0)
     clip_epsilon: float = setting(0.3, above=0)
 
 
@@ -73,7 +70,7 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
             data = jax.tree.map(lambda x: x[rows], batch.transitions)
             grads, metrics = jax.grad(loss_fn, has_aux=True)(params, normalizer, data, loss_key)
             if is_adaptive:
-                rate = _adapt_rate(rate, metrics["kl_mean"], config.target_kl)
+                rate = adapt_rate(rate, metrics["kl_mean"], config.target_kl)
             metrics["grad_norm"] = optax.global_norm(grads)
             params, opt_state = descend(optimizer, params, grads, opt_state, rate * rate_factor)
             return (params, opt_state, rate, key), metrics
@@ -105,13 +102,6 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
         }
 
     return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)
-
-
-def _adapt_rate(rate: jax.Array, kl: jax.Array, target: float) -> jax.Array:
-    """Source: rsl_rl's schedule: ÷ 1.5 above twice the target, × 1.5 below half of it, within 1e-5 and 1e-2."""
-    slower = jnp.where(kl > 2.0 * target, rate / 1.5, rate)
-    faster = jnp.where((kl < 0.5 * target) & (kl > 0.0), slower * 1.5, slower)
-    return jnp.clip(faster, 1e-5, 1e-2)
 
 
 def _loss_metrics(metrics: Metrics) -> Metrics:

@@ -15,7 +15,7 @@ from mjx_walk.on_policy import (
     make_on_policy,
     require_whole_minibatches,
 )
-from mjx_walk.policy_gradient import learn_once
+from mjx_walk.policy_gradient import learn_once, sampled_kl
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -62,7 +62,8 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
         log_prob = distribution.log_prob(logits, transitions.extras["policy_extras"]["raw_action"])
         entropy = distribution.entropy(logits, key).mean()
         policy_loss = -(weight * advantage * log_prob).sum() / jnp.maximum(weight.sum(), 1.0)
-        return policy_loss - entropy_cost * entropy, {"policy_loss": policy_loss, "entropy": entropy}
+        kl = sampled_kl(log_prob, transitions.extras["policy_extras"]["log_prob"])
+        return policy_loss - entropy_cost * entropy, {"policy_loss": policy_loss, "entropy": entropy, "kl": kl}
 
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         transitions = batch.transitions._replace(next_observation=())
