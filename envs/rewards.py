@@ -48,7 +48,7 @@ class Shaping:
     keep_y: float = setting(0.0, at_least=0)
     """`exp(-y²)` at each step, y in m: for walking straight. Not in Walker2d, which has no y."""
     shaking: float = setting(0.0, at_least=0)
-    """Minus the mean square of the motors' joint velocities, (rad/s)²."""
+    """Minus the mean square of the last joint velocities, one for each motor, (rad/s)²."""
     falling: float = setting(0.0, at_least=0)
     """Minus one at the step that terminates the episode."""
     backward: float = setting(0.0, at_least=0)
@@ -78,6 +78,7 @@ def load_reward_function(source: str) -> RewardFunction:
         UserError: there is no such file or function, or the file cannot be run.
     """
     path, _, name = source.rpartition(":")
+    path = str(Path(path).expanduser())
     if not Path(path).is_file():
         raise UserError(f"env.reward_function={source}: no file '{path}'; write PATH.py:FUNCTION")
     spec = importlib.util.spec_from_file_location(Path(path).stem, path)
@@ -93,17 +94,27 @@ def load_reward_function(source: str) -> RewardFunction:
     return getattr(module, name)
 
 
-def term_names(function: RewardFunction, source: str, example: RewardStep) -> tuple[str, ...]:
+def term_names(function: RewardFunction, source: str, example: RewardStep, shaped: Terms) -> tuple[str, ...]:
     """The names of a reward function's terms, which it must give for every step.
 
+    Args:
+        function: as loaded.
+        source: where from.
+        example: a step of the right shapes.
+        shaped: the terms that are added to it.
+
     Raises:
-        UserError: it fails, or does not give scalars by name.
+        UserError: it fails, or does not give scalars by names of its own.
     """
     try:
-        terms = jax.eval_shape(function, example)
+        terms = jax.eval_shape(lambda step: function(step._replace(dt=example.dt)), example)
     except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else ""
         raise UserError(f"env.reward_function={source}: {type(error).__name__}: {reason}") from error
     if not isinstance(terms, dict) or not terms or any(getattr(term, "shape", None) != () for term in terms.values()):
         raise UserError(f"env.reward_function={source}: must return a dict of scalars by name")
+    for name in terms:
+        if not str(name).startswith("reward_") or name in shaped:
+            problem = "is one of env.shaping's" if name in shaped else "does not begin with reward_"
+            raise UserError(f"env.reward_function={source}: the term's name '{name}' {problem}; choose another")
     return tuple(terms)

@@ -63,6 +63,11 @@ class TaskOptions:
         for field in dataclasses.fields(self):  # a range comes as a list from a configuration file
             if isinstance(getattr(self, field.name), list):
                 setattr(self, field.name, tuple(getattr(self, field.name)))
+        if isinstance(self.shaping, dict):
+            unknown = self.shaping.keys() - {field.name for field in dataclasses.fields(Shaping)}
+            if unknown:
+                raise UserError(f"unknown key 'env.shaping.{min(unknown)}'")
+            self.shaping = Shaping(**self.shaping)
 
 
 class Task(abc.ABC):
@@ -110,6 +115,8 @@ class Task(abc.ABC):
         self.observation_size = sum(self.observation_blocks().values())
         if options.shaping.keep_y and not self.HAS_Y:
             raise UserError(f"env.shaping.keep_y={options.shaping.keep_y}: {options.name} has no y")
+        if options.shaping.falling and not getattr(options, "terminate_when_unhealthy", False):
+            raise UserError(f"env.shaping.falling={options.shaping.falling}: no fall ends an episode here")
         self._reward_function = load_reward_function(options.reward_function) if options.reward_function else None
         self.reward_terms = self._reward_terms()
         self.metric_names = (*self.reward_terms, "nonfinite", "overflow")
@@ -131,6 +138,11 @@ class Task(abc.ABC):
         if kwargs.get("xml_file"):
             kwargs["xml_file"] = str(Path(kwargs["xml_file"]).expanduser().resolve())
         return kwargs
+
+    @property
+    def has_own_reward(self) -> bool:
+        """Whether it is trained on another reward than Gymnasium's."""
+        return self._reward_function is not None or any(dataclasses.asdict(self.options.shaping).values())
 
     # What a task defines.
 
@@ -203,10 +215,10 @@ class Task(abc.ABC):
         physics = PhysicsState(self.init_qpos, self.init_qvel, self.init_qvel)
         obs, action = jnp.zeros(self.observation_size), jnp.zeros(self.action_size)
         step = RewardStep(terms, jnp.float32(0.0), physics, physics, obs, action, jnp.zeros((), bool), self.dt)
-        names = tuple(terms)
+        names, shaped = tuple(terms), shaping_terms(self.options.shaping, step)
         if self._reward_function:
-            names = term_names(self._reward_function, str(self.options.reward_function), step)
-        return (*names, *shaping_terms(self.options.shaping, step))
+            names = term_names(self._reward_function, str(self.options.reward_function), step, shaped)
+        return (*names, *shaped)
 
     def step(self, state: State, action: jax.Array) -> State:
         """One environment step of `frame_skip` physics steps.

@@ -35,7 +35,7 @@ class Run:
             UserError: there is no usable policy.
         """
         self.path = folder.path
-        self.config = read_config(folder.config)
+        self.config = _without_lost_reward(read_config(folder.config))
         engine = physics or self.config.physics
         if physics is None and engine == "c" and jax.default_backend() != "cpu":
             engine = "auto"
@@ -140,6 +140,14 @@ def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | 
     """
     folder, _ = train(resolve(overrides or []), on_metrics)
     return load_run(folder.path)
+
+
+def _without_lost_reward(config: Config) -> Config:
+    """Without a reward function whose file is not there any more: the policy and its score do not need it."""
+    source = config.env.reward_function
+    if source is None or Path(source.rpartition(":")[0]).expanduser().is_file():
+        return config
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, reward_function=None))
 
 
 def _announce(config: Config, folder: RunFolder) -> None:

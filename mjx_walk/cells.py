@@ -1,8 +1,9 @@
 """The cells of a comparison: each variant with each seed is a training run in a folder and process of its own."""
 
+import contextlib
 import dataclasses
+import fcntl
 import itertools
-import json
 import os
 import re
 import shutil
@@ -10,18 +11,21 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from mjx_walk.config import Config, complete_overrides, flatten, load_config, read_config
+from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.errors import UserError
 from mjx_walk.interrupt import Interrupt
 from mjx_walk.metrics import read_rows
 from mjx_walk.run_folder import MAY_DIFFER, RunFolder
 
 _SECONDS_BETWEEN_REPORTS = 30.0
+_MEMORY_FRACTION = 0.75
+"""Of a GPU's memory that JAX takes at the start; its own default."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,18 +58,19 @@ class Cell:
             return False
         if not self.config.evaluation.gymnasium_episodes:
             return True
-        scores = self.folder.gymnasium_scores
-        return scores.exists() and len(json.loads(scores.read_text())["returns"]) > 0
+        return self.folder.gymnasium_scores.exists()
 
 
-def plan(overrides: list[str], algos: list[str], seeds: list[int], out: Path, hardware: str) -> list[Cell]:
-    """All cells, seeds outermost, so that every variant has a first curve early.
+def plan(
+    overrides: list[str], algos: list[str], seeds: list[int], out: str | None, hardware: str
+) -> tuple[Path, list[Cell]]:
+    """Folder and cells of a comparison, seeds outermost, so that every variant has a first curve early.
 
     Args:
         overrides: as for `train`; a comma makes variants, `algo.learning_rate=1e-3,3e-4`.
         algos: algorithms.
         seeds: seeds.
-        out: folder of the comparison.
+        out: folder of the comparison; by default `runs/compare_ENV`.
         hardware: `gpu` or `cpu`, the size of the recipes.
 
     Raises:
@@ -77,35 +82,44 @@ def plan(overrides: list[str], algos: list[str], seeds: list[int], out: Path, ha
     for override in parsed:
         if override.key_or_group in own:
             raise UserError(f"'{override.input_line}': in a comparison write {own[override.key_or_group]}")
-        if override.is_sweep_override():
+        if not override.is_sweep_override():
+            choices.append([str(override.input_line)])
+        elif override.is_choice_sweep():
             values = override.sweep_string_iterator()
             choices.append([f"{override.key_or_group}={value}" for value in values])
         else:
-            choices.append([str(override.input_line)])
+            raise UserError(f"'{override.input_line}': list the values, {override.key_or_group}=A,B")
+    first = load_config([options[0] for options in choices])
+    folder = Path(out or f"runs/compare_{first.env.name}")
     cells: dict[str, Cell] = {}
     for seed, chosen in itertools.product(seeds, itertools.product(*choices)):
         swept = [text for text, options in zip(chosen[1:], choices[1:], strict=True) if len(options) > 1]
         # No "=" and no ",", which would mean something to Hydra where the folder is named to it again.
-        parts = [re.sub(r"[^\w.+]+", "-", text.removeprefix("algo").lstrip("=.")) for text in (chosen[0], *swept)]
-        variant = "_".join(parts)
-        run_dir = out / variant / f"seed_{seed}"
+        parts = (text.removeprefix("algo").lstrip("=.").replace("=", "-") for text in (chosen[0], *swept))
+        variant = "_".join(re.sub(r"[^\w.+-]+", "_", part) for part in parts)
+        run_dir = folder / variant / f"seed_{seed}"
         quoted = str(run_dir).replace("\\", "\\\\").replace("'", "\\'")
         arguments = (*chosen, f"seed={seed}", f"run_dir='{quoted}'")
         cell = Cell(variant, arguments, load_config(list(arguments)))
         if cells.setdefault(cell.name, cell).config != cell.config:
             raise UserError(f"two variants would share the folder {run_dir}; compare them in two comparisons")
+    environments = {f"{cell.config.env.name} {cell.config.env.version}" for cell in cells.values()}
+    if len(environments) > 1:
+        raise UserError(f"one comparison is of one environment, not of {', '.join(sorted(environments))}")
     for cell in cells.values():
         _check_same_configuration(cell)
-    return list(cells.values())
+    return folder, list(cells.values())
 
 
-def start(cell: Cell, log: Path, device: int | None) -> subprocess.Popen:
+def start(cell: Cell, log: Path, device: int | None, share: int, lock: int) -> subprocess.Popen:
     """Train a cell, from where it was left, in a process of its own.
 
     Args:
         cell: not finished.
         log: file for what it prints.
         device: the GPU that it is to see; None leaves that as it is.
+        share: runs that share the GPU.
+        lock: a file descriptor to inherit.
     """
     resume = bool(list(cell.folder.checkpoints.glob("[0-9]*")))
     if not resume and cell.folder.config.exists():
@@ -114,11 +128,14 @@ def start(cell: Cell, log: Path, device: int | None) -> subprocess.Popen:
     if device is not None:
         visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
         env["CUDA_VISIBLE_DEVICES"] = visible[device] if visible else str(device)
+    if share > 1:
+        env.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{_MEMORY_FRACTION / share:.2f}")
     log.parent.mkdir(parents=True, exist_ok=True)
     arguments = [sys.executable, "-m", "mjx_walk.train", *cell.overrides, *(["resume=true"] if resume else [])]
     with log.open("a") as file:
         # A session of its own: Ctrl-C is for the parent, which passes it on once.
-        return subprocess.Popen(arguments, stdout=file, stderr=subprocess.STDOUT, env=env, start_new_session=True)
+        pipes = {"stdout": file, "stderr": subprocess.STDOUT, "pass_fds": (lock,)}
+        return subprocess.Popen(arguments, env=env, start_new_session=True, **pipes)  # type: ignore[call-overload]
 
 
 def run(cells: list[Cell], devices: list[int | None], logs: Path, on_end: Callable[[Cell], None]) -> str | None:
@@ -134,27 +151,47 @@ def run(cells: list[Cell], devices: list[int | None], logs: Path, on_end: Callab
         The name of the signal that stopped it early, if one did; all cells have then saved.
     """
     waiting, running, free = list(cells), dict[subprocess.Popen, tuple[Cell, int | None]](), list(devices)
+    share = len(devices) // len(set(devices))
     last_report = time.monotonic()
-    with Interrupt("the runs are saving") as interrupt:
-        while (waiting or running) and not interrupt.signal_name:
-            while waiting and free:
-                cell, device = waiting.pop(0), free.pop(0)
-                running[start(cell, logs / f"{cell.name}.txt", device)] = (cell, device)
-            time.sleep(0.5)
-            for process in [process for process in running if process.poll() is not None]:
-                cell, device = running.pop(process)
-                free.append(device)
-                on_end(cell)
-            if time.monotonic() - last_report > _SECONDS_BETWEEN_REPORTS:
-                last_report = time.monotonic()
-                for cell, _ in running.values():
-                    print(f"  {cell.name}: {_progress(cell)}", flush=True)
-        for process in running:
-            process.send_signal(signal.SIGTERM)
-        for process, (cell, _) in running.items():
-            process.wait()
+    with _only_one_at_a_time(logs) as lock, Interrupt("the runs are saving") as interrupt:
+        try:
+            while (waiting or running) and not interrupt.signal_name:
+                while waiting and free:
+                    cell, device = waiting.pop(0), free.pop(0)
+                    running[start(cell, logs / f"{cell.name}.txt", device, share, lock)] = (cell, device)
+                time.sleep(0.5)
+                for process in [process for process in running if process.poll() is not None]:
+                    cell, device = running.pop(process)
+                    free.append(device)
+                    on_end(cell)
+                if time.monotonic() - last_report > _SECONDS_BETWEEN_REPORTS:
+                    last_report = time.monotonic()
+                    for cell, _ in running.values():
+                        print(f"  {cell.name}: {_progress(cell)}", flush=True)
+        finally:  # however it ends, no run goes on alone
+            for process in running:
+                process.send_signal(signal.SIGTERM)
+            for process in running:
+                process.wait()
+        for cell, _ in running.values():
             on_end(cell)
     return interrupt.signal_name
+
+
+@contextlib.contextmanager
+def _only_one_at_a_time(folder: Path) -> Iterator[int]:
+    """A lock that the runs inherit, so that it is held as long as one of them lives."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / "lock").open("w")
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror}") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise UserError(f"runs of {folder.parent} are still going on; wait for them, or end them") from error
+        yield file.fileno()
 
 
 def _progress(cell: Cell) -> str:
@@ -169,7 +206,9 @@ def _progress(cell: Cell) -> str:
 def count_devices() -> tuple[str, int]:
     """`gpu` or `cpu`, and how many; asked in another process, since JAX would claim the memory of all of them."""
     code = "import jax; print(jax.default_backend() != 'cpu', jax.local_device_count())"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise UserError(f"JAX does not start: {done.stderr.strip().splitlines()[-1]}")
     is_gpu, count = done.stdout.split()[-2:]
     return ("gpu", int(count)) if is_gpu == "True" else ("cpu", 1)
 
@@ -177,9 +216,12 @@ def count_devices() -> tuple[str, int]:
 def _check_same_configuration(cell: Cell) -> None:
     if not cell.folder.config.exists():
         return
-    old, new = flatten(read_config(cell.folder.config)), flatten(cell.config)
-    # The engine may have been chosen by itself.
-    differing = [key for key in new if key not in (*MAY_DIFFER, "physics") and old.get(key) != new[key]]
+    saved = read_config(cell.folder.config)
+    new = dataclasses.replace(cell.config, physics=resolve_engine(cell.config.physics))
+    old_settings, settings = flatten(saved), flatten(new)
+    differing = [key for key in settings if key not in MAY_DIFFER and old_settings.get(key) != settings[key]]
+    if cell.config.total_steps < saved.total_steps:
+        differing.append("total_steps, which may only grow")
     if differing:
         raise UserError(
             f"{cell.folder.path} holds a run with other settings ({', '.join(differing)}); choose another out=DIR"

@@ -2,9 +2,11 @@
 
 import dataclasses
 import sys
+import typing
 from collections.abc import Callable
 from typing import Any, NoReturn, TypeVar
 
+import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -29,15 +31,17 @@ def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Argument
         print(usage.strip())
         raise SystemExit(0)
     known = [field.name for field in dataclasses.fields(schema)]  # type: ignore[arg-type]
-    node = OmegaConf.structured(schema)
+    node, hints = OmegaConf.structured(schema), typing.get_type_hints(schema)
     for argument in arguments:
         key, equals, value = argument.partition("=")
         if not equals or key not in known:
             problem = f"unknown key '{key}'" if equals else f"cannot read '{argument}', write key=value"
             raise UserError(f"{problem}; valid: {', '.join(known)}")
         try:
-            OmegaConf.update(node, key, OmegaConf.from_dotlist([f"value={value}"]).value)
-        except OmegaConfBaseException as error:
+            is_text = hints[key] in (str, str | None)  # a folder may be called 007
+            read = value if is_text else OmegaConf.from_dotlist([f"value={value}"]).value
+            OmegaConf.update(node, key, read)
+        except (OmegaConfBaseException, yaml.YAMLError) as error:
             raise UserError(f"{argument}: {str(error).splitlines()[0]}") from error
     parsed: Any = OmegaConf.to_object(node)
     validate(parsed)

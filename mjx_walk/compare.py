@@ -18,7 +18,7 @@ usage: python -m mjx_walk.compare [env=ENV] ['algos=[ppo,sac,td3]'] [seeds=3] [o
 
   algos=[…]            algorithms, each with its recipe for the environment; all of them unless said otherwise
   seeds=N or [3,7]     the seeds 0 to N-1, or these
-  KEY=VALUE            as for train, for all runs: env=walker2d total_steps=1e6
+  KEY=VALUE            as for train, for all runs: env=walker2d total_steps=1_000_000
   KEY=A,B,C            a variant for each value: algo.learning_rate=1e-3,3e-4
   out=DIR              by default runs/compare_ENV; what is finished there is kept, what was interrupted goes on
   devices=N            GPUs to use, a run on each; by default all
@@ -45,10 +45,10 @@ def main(arguments: list[str]) -> int:
     is_own = [argument.partition("=")[0] in own_keys or argument in ("-h", "--help") for argument in arguments]
     own = cli.parse(Arguments, [a for a, mine in zip(arguments, is_own, strict=True) if mine], USAGE)
     overrides = [a for a, mine in zip(arguments, is_own, strict=True) if not mine]
-    env = next((o.partition("=")[2] for o in overrides if o.startswith("env=")), "humanoid")
-    out = Path(own.out or f"runs/compare_{env}")
     if own.draw:
-        _report(out)
+        if own.out is None:
+            raise UserError("say which runs to draw: out=DIR")
+        _report(Path(own.out))
         return 0
     if not own.algos:
         raise UserError(f"algos=[]: choose some of: {', '.join(ALGORITHMS)}")
@@ -57,26 +57,29 @@ def main(arguments: list[str]) -> int:
     count = own.devices or available
     if count > available:
         raise UserError(f"devices={count}: this machine has {available}")
-    planned = cells.plan(overrides, list(own.algos), seeds, out, hardware)
+    out, planned = cells.plan(overrides, list(own.algos), seeds, own.out, hardware)
     open_cells = [cell for cell in planned if not cell.is_finished]
     print(f"{len(planned)} runs, {len(planned) - len(open_cells)} of them finished before, in {out}", flush=True)
 
     def on_end(cell: cells.Cell) -> None:
-        if cell.is_finished:
-            print(f"{cell.name}: finished", flush=True)
-            write_report(out)
-        else:
+        if not cell.is_finished:
             print(f"{cell.name}: not finished; see {out}/logs/{cell.name}.txt", flush=True)
+            return
+        print(f"{cell.name}: finished", flush=True)
+        try:
+            write_report(out)
+        except (UserError, OSError, ValueError) as error:  # no reason to end the others
+            print(f"warning: {out} could not be drawn: {error}", file=sys.stderr)
 
     slots: list[int | None] = list(range(count)) if hardware == "gpu" else [None]
     signal_name = cells.run(open_cells, slots * own.per_device, out / "logs", on_end)
     if signal_name:
         print(f"Stopped by {signal_name}; the same command goes on.")
         return exit_code(signal_name)
-    _report(out)
     failed = [cell.name for cell in planned if not cell.is_finished]
     if failed:
         print(f"not finished: {', '.join(failed)}", file=sys.stderr)
+    _report(out)
     return 1 if failed else 0
 
 

@@ -13,7 +13,7 @@ import scipy.stats
 from mjx_walk.config import Config, flatten, read_config
 from mjx_walk.errors import UserError
 from mjx_walk.metrics import Row, read_rows
-from mjx_walk.run_folder import MAY_DIFFER, RunFolder
+from mjx_walk.run_folder import RunFolder
 
 MIN_SEEDS_FOR_INTERVALS = 5
 _POINTS = 200
@@ -100,18 +100,21 @@ def write_report(folder: Path) -> Path:
         The Markdown file.
 
     Raises:
-        UserError: see `read_runs`.
+        UserError: see `read_runs`; or the folder cannot be written to.
     """
     groups = group(read_runs(folder))
-    _draw(groups, folder / "comparison.png")
-    _write_csv(groups, folder / "comparison.csv")
     path = folder / "comparison.md"
-    path.write_text(_markdown(groups))
+    try:
+        _draw(groups, folder / "comparison.png")
+        _write_csv(groups, folder / "comparison.csv")
+        path.write_text(_markdown(groups))
+    except OSError as error:
+        raise UserError(f"cannot write to '{folder}': {error.strerror}") from error
     return path
 
 
 def _settings(config: Config) -> dict:
-    return {key: value for key, value in flatten(config).items() if key not in (*MAY_DIFFER, "seed", "physics")}
+    return {key: value for key, value in flatten(config).items() if key not in ("run_dir", "resume", "seed")}
 
 
 def _final_score(run: Curve) -> float | None:

@@ -60,7 +60,9 @@ class Scores:
             "versions": versions(),
             **facts,
         }
-        path.write_text(json.dumps(content, indent=1))
+        unfinished = path.with_suffix(".unfinished")
+        unfinished.write_text(json.dumps(content, indent=1))
+        unfinished.replace(path)
 
 
 def versions() -> dict[str, str]:

@@ -106,6 +106,8 @@ class Trainer:
         progress = Progress(self.num_chunks * self.steps_per_chunk, chunk * self.steps_per_chunk)
         saved_chunk = chunk if self.config.resume else -1
         self._times.append((time.monotonic(), chunk))
+        if chunk < self.num_chunks:
+            self.folder.gymnasium_scores.unlink(missing_ok=True)  # of a shorter run
         pending: tuple[int, Metrics] | None = None
 
         def log(chunk: int, metrics: Metrics) -> None:
@@ -144,12 +146,14 @@ class Trainer:
         """Score the last policy in the real Gymnasium, and write `eval_gymnasium.json`.
 
         Where an earlier one did better in the evaluations beside training, that one is scored too, and the better
-        of the two is kept.
+        of the two is kept. Under a reward of one's own it is that earlier one alone.
         """
         num_episodes = self.config.evaluation.gymnasium_episodes
         if num_episodes:
             scored: list[tuple[Scores, Any, dict[str, Any]]] = []
-            for params, facts in self._policies:
+            # By a reward of one's own another policy may be the best than by Gymnasium's, which does not choose then.
+            candidates = self._policies[-1:] if self.task.has_own_reward else self._policies
+            for params, facts in candidates:
                 if not scored or facts["eval_return"] > scored[0][0].mean:
                     scored.append((self._score_in_gymnasium(params, num_episodes), params, facts))
             scores, params, facts = max(scored, key=lambda candidate: candidate[0].mean)

@@ -49,6 +49,7 @@ class OnPolicyConfig:
     entropy_schedule: str = setting("constant", choices=("constant", "linear"))
     """`linear`: to zero over `schedule_steps`."""
     value_cost: float = setting(0.5, above=0)
+    """Of the squared error; PPO's loss, which is Brax's, halves it once more."""
     reward_scale: float = setting(0.1, above=0)
     normalize_rewards: bool = False
     """Divide rewards by the running std of the discounted return, before `reward_scale`."""
@@ -63,8 +64,8 @@ class OnPolicyConfig:
     init_noise_std: float = setting(1.0, above=0)
     """Of a std that does not depend on the state."""
     state_dependent_std: bool = False
-    min_log_std: float = -20.0
-    max_log_std: float = 2.0
+    min_log_std: float = setting(-20.0, at_least=-80, at_most=80)
+    max_log_std: float = setting(2.0, at_least=-80, at_most=80)
     """The same as `min_log_std` for a std that does not learn."""
     stagger_episodes: bool = True
 

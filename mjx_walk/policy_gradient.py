@@ -9,6 +9,7 @@ import optax
 from brax.training.acme.running_statistics import RunningStatisticsState
 
 from mjx_walk import networks
+from mjx_walk.errors import UserError
 from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyGround, OnPolicyState
 from mjx_walk.optimizers import descend
 from mjx_walk.schedules import adapt_rate, factor
@@ -37,10 +38,15 @@ def learn_once(
 
     Returns:
         The state after it, and all metrics.
+
+    Raises:
+        UserError: a rate that adapts to the KL, of which a single gradient step knows nothing.
     """
+    is_adaptive = config.learning_rate_schedule == "adaptive_kl"
+    if is_adaptive and num_minibatches == 1:
+        raise UserError("algo.learning_rate_schedule=adaptive_kl needs algo.num_minibatches of 2 or more")
     key, shuffle_key, loss_key = jax.random.split(state.key, 3)
     remaining = ground.remaining(state)
-    is_adaptive = config.learning_rate_schedule == "adaptive_kl"
     rate_factor = factor(config.learning_rate_schedule, remaining)
     entropy_cost = config.entropy_cost * factor(config.entropy_schedule, remaining)
     # The policy that acted had the old normalizer, which its KL is to be measured under.
@@ -81,4 +87,4 @@ def sampled_kl(log_prob: jax.Array, acted_log_prob: jax.Array) -> jax.Array:
     Source: Schulman 2020, "Approximating KL divergence", the third estimator.
     """
     log_ratio = jnp.minimum(log_prob - acted_log_prob, 10.0)
-    return (jnp.exp(log_ratio) - 1.0 - log_ratio).mean()
+    return (jnp.expm1(log_ratio) - log_ratio).mean()

@@ -8,6 +8,7 @@ from toy_tasks import DelayedReward, RewardedAction
 
 from mjx_walk import networks
 from mjx_walk.algos.a2c import A2CConfig, make_a2c
+from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.noise import OrnsteinUhlenbeck
 from mjx_walk.policy_gradient import sampled_kl
@@ -84,6 +85,12 @@ def test_sampled_kl_is_that_of_two_gaussians():
     acted, learned = -0.5 * drawn**2, -0.5 * (drawn - 0.3) ** 2
     assert float(sampled_kl(learned, acted)) == pytest.approx(0.045, rel=0.02)
     assert float(sampled_kl(acted, acted)) == 0.0
+
+
+def test_adaptive_rate_needs_several_minibatches():
+    _, algorithm, state, batch = collected(RewardedAction(), learning_rate_schedule="adaptive_kl")
+    with pytest.raises(UserError, match=r"needs algo\.num_minibatches of 2 or more"):
+        algorithm.learn(state, batch)
 
 
 def test_adaptive_rate_falls_where_the_policy_moves_too_fast():

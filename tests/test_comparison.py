@@ -39,7 +39,8 @@ def fake_run(folder, overrides, returns, score=None):
 
 def test_variants_are_the_product_of_algorithms_swept_values_and_seeds(tmp_path):
     overrides = ["env=walker2d", "algo.discount=0.9,0.95", "total_steps=1000"]
-    planned = cells.plan(overrides, ["ppo", "a2c"], [0, 7], tmp_path / "a b's", "cpu")
+    out, planned = cells.plan(overrides, ["ppo", "a2c"], [0, 7], str(tmp_path / "a b's"), "cpu")
+    assert out == tmp_path / "a b's"
     assert [cell.name for cell in planned] == [
         f"{algo}_discount-{discount}/seed_{seed}"
         for seed in (0, 7)
@@ -54,14 +55,25 @@ def test_variants_are_the_product_of_algorithms_swept_values_and_seeds(tmp_path)
 
 
 def test_what_is_named_twice_is_run_once(tmp_path):
-    assert len(cells.plan(["env=walker2d"], ["ppo", "ppo"], [0, 0, 1], tmp_path, "cpu")) == 2
-    layers = ["env=walker2d", "algo.policy_hidden_layer_sizes=[32,32],[32,64]"]
-    assert [c.variant for c in cells.plan(layers, ["ppo"], [0], tmp_path, "cpu")] == [
-        "ppo_policy_hidden_layer_sizes-32-32-",
-        "ppo_policy_hidden_layer_sizes-32-64-",
+    assert len(cells.plan(["env=walker2d"], ["ppo", "ppo"], [0, 0, 1], str(tmp_path), "cpu")[1]) == 2
+
+
+def test_variants_have_folders_of_their_own(tmp_path):
+    def variants(sweep):
+        return [cell.variant for cell in cells.plan(["env=walker2d", sweep], ["sac"], [0], str(tmp_path), "cpu")[1]]
+
+    assert variants("algo.target_entropy=-0.5,0.5") == ["sac_target_entropy--0.5", "sac_target_entropy-0.5"]
+    assert variants("algo.policy_hidden_layer_sizes=[32,32],[32,64]") == [
+        "sac_policy_hidden_layer_sizes-_32_32_",
+        "sac_policy_hidden_layer_sizes-_32_64_",
     ]
     with pytest.raises(UserError, match="would share the folder"):
-        cells.plan(["env=walker2d", "env.xml_file=a-b,a:b"], ["ppo"], [0], tmp_path, "cpu")
+        variants("env.xml_file=a:b,a/b")
+
+
+def test_the_folder_is_named_after_the_environment_that_is_trained(tmp_path):
+    out, _ = cells.plan(["recipe=report/e_td3"], ["td3"], [0], None, "cpu")
+    assert str(out) == "runs/compare_walker2d"
 
 
 def test_runs_are_grouped_by_what_sets_them_apart(tmp_path):
@@ -69,9 +81,11 @@ def test_runs_are_grouped_by_what_sets_them_apart(tmp_path):
         fake_run(tmp_path / f"x{seed}", ["env=walker2d", f"seed={seed}"], [1, 2, 3], score)
         fake_run(tmp_path / "sweep" / str(seed), ["env=walker2d", f"seed={seed}", "algo.discount=0.5"], [0, 1])
     fake_run(tmp_path / "other", ["env=walker2d", "algo=a2c"], [5])
+    fake_run(tmp_path / "engine", ["env=walker2d", "algo=a2c", "physics=jax"], [5])
     groups = comparison.group(comparison.read_runs(tmp_path))
     assert {label: len(runs) for label, runs in groups.items()} == {
-        "a2c": 1,
+        "a2c, physics=auto": 1,
+        "a2c, physics=jax": 1,
         "ppo, discount=0.99": 2,
         "ppo, discount=0.5": 2,
     }
@@ -79,7 +93,7 @@ def test_runs_are_grouped_by_what_sets_them_apart(tmp_path):
     assert "| ppo, discount=0.99 | 2 | 15 | 7 | – | 10 | 3.00 | 30 |" in text
     assert "| ppo, discount=0.5 | 0 of 2 scored | – | – | – | – | 2.00 | 20 |" in text
     rows = list(csv.DictReader((tmp_path / "comparison.csv").open()))
-    assert len(rows) == 5 and {row["gymnasium_mean"] for row in rows} == {"10.0", "20.0", ""}
+    assert len(rows) == 6 and {row["gymnasium_mean"] for row in rows} == {"10.0", "20.0", ""}
     assert (tmp_path / "comparison.png").read_bytes()[:4] == b"\x89PNG"
 
 
@@ -156,6 +170,11 @@ BAD = [
     (["env=ant"], "unknown env 'ant'"),
     (["algo.discount=0.9,2.0"], "algo.discount=2.0: must be at most 1"),
     (["draw=true", "out=nowhere"], "no runs below 'nowhere'"),
+    (["draw=true"], "say which runs to draw: out=DIR"),
+    (["env=walker2d,humanoid"], "one comparison is of one environment, not of humanoid v5, walker2d v5"),
+    (["env.version=v4,v5"], "one comparison is of one environment"),
+    (["algo.discount=interval(0.9,0.99)"], "list the values, algo.discount=A,B"),
+    (["algos=[ppo"], "algos=[ppo: "),
 ]
 
 
@@ -173,8 +192,51 @@ def test_a_folder_with_other_settings_is_left_alone(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(cells, "count_devices", lambda: ("cpu", 1))
     fake_run(tmp_path / "out" / "ppo" / "seed_0", ["env=walker2d", "num_envs=128"], [1])
-    with pytest.raises(UserError, match="holds a run with other settings \\(num_envs\\); choose another out=DIR"):
-        compare_command.main(["env=walker2d", "algos=[ppo]", "out=out", "num_envs=256"])
+    for change, named in (
+        ("num_envs=256", "num_envs"),
+        ("total_steps=5", "total_steps, which"),
+        ("physics=jax", "physics"),
+    ):
+        with pytest.raises(UserError, match=f"holds a run with other settings \\(.*{named}.*; choose another out=DIR"):
+            compare_command.main(["env=walker2d", "algos=[ppo]", "out=out", change])
+
+
+class FakeProcess:
+    """A run that goes on until it is told to stop."""
+
+    def __init__(self, code=None):
+        self.code, self.signals = code, []
+
+    def poll(self):
+        return self.code
+
+    def send_signal(self, number):
+        self.signals.append(number)
+
+    def wait(self):
+        return self.code
+
+
+def test_no_run_goes_on_alone(tmp_path, monkeypatch):
+    """One of two runs ends, and what is to be done then fails."""
+    _, planned = cells.plan(["env=walker2d"], ["ppo"], [0, 1], str(tmp_path), "cpu")
+    processes = [FakeProcess(code=0), FakeProcess()]
+    monkeypatch.setattr(cells, "start", lambda cell, *_: processes[cell.config.seed])
+    with pytest.raises(ZeroDivisionError):
+        cells.run(planned, [0, 1], tmp_path / "logs", lambda cell: 1 // 0)
+    assert processes[1].signals == [signal.SIGTERM]
+
+
+def test_a_second_comparison_in_the_same_folder_waits_its_turn(tmp_path):
+    with cells._only_one_at_a_time(tmp_path / "out" / "logs"), pytest.raises(UserError, match="still going on"):
+        cells.run([], [None], tmp_path / "out" / "logs", lambda cell: None)
+    assert cells.run([], [None], tmp_path / "out" / "logs", lambda cell: None) is None
+
+
+def test_a_run_that_fails_is_named(tmp_path):
+    done = command("compare", "algos=[ppo]", "seeds=1", "out=out", *SMALL, "num_envs=7", cwd=tmp_path)
+    assert done.returncode in (1, 2) and "not finished: ppo/seed_0" in done.stderr
+    assert "choose num_envs a multiple of" in (tmp_path / "out" / "logs" / "ppo" / "seed_0.txt").read_text()
 
 
 @pytest.mark.slow
@@ -194,8 +256,9 @@ def test_each_run_sees_its_own_gpu(tmp_path, monkeypatch, visible, expected):
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     started = []
     monkeypatch.setattr(subprocess, "Popen", lambda arguments, **kwargs: started.append((arguments, kwargs["env"])))
-    (cell,) = cells.plan(["env=walker2d"], ["ppo"], [3], tmp_path, "gpu")
-    cells.start(cell, tmp_path / "logs" / "cell.txt", 1)
+    _, (cell,) = cells.plan(["env=walker2d"], ["ppo"], [3], str(tmp_path), "gpu")
+    cells.start(cell, tmp_path / "logs" / "cell.txt", 1, 2, 0)
     ((arguments, environment),) = started
     assert environment["CUDA_VISIBLE_DEVICES"] == expected
+    assert float(environment["XLA_PYTHON_CLIENT_MEM_FRACTION"]) <= 0.75 / 2 + 0.01
     assert "seed=3" in arguments and "resume=true" not in arguments

@@ -68,7 +68,11 @@ def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
 
 @pytest.mark.parametrize("algo", ["a2c", "reinforce"])
 def test_policy_gradient_resume_is_exact(tmp_path, algo):
-    settings = [f"algo={algo}", "updates_per_chunk=1", *(["algo.ou_noise_std=0.1"] if algo == "a2c" else [])]
+    settings = [
+        f"algo={algo}",
+        "updates_per_chunk=1",
+        "algo.ou_noise_std=0.1" if algo == "a2c" else "algo.discount=0.5",
+    ]
     tiny = [setting for setting in TINY if "num_epochs" not in setting]
     train(tmp_path / "whole", *settings, f"total_steps={4 * TINY_CHUNK}", tiny=tiny)
     train(tmp_path / "halves", *settings, f"total_steps={2 * TINY_CHUNK}", tiny=tiny)

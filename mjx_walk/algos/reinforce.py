@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from mjx_walk import returns
 from mjx_walk.envs import Task
+from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.on_policy import (
     OnPolicyBatch,
@@ -49,8 +50,14 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
         config: settings.
 
     Raises:
-        UserError: the batch does not divide into the minibatches.
+        UserError: the batch does not divide into the minibatches, or its pieces are too short to learn from.
     """
+    unseen_at_best = config.discount**config.unroll_length
+    if unseen_at_best > config.max_unseen:
+        raise UserError(
+            f"algo.unroll_length={config.unroll_length}: what follows a piece counts {unseen_at_best:.2f} at its first "
+            f"step, above algo.max_unseen={config.max_unseen}; lengthen it, or lower algo.discount"
+        )
     require_whole_minibatches(num_envs, config.num_unrolls, config.num_minibatches)
     ground = make_on_policy(task, num_envs, evaluation, config, has_value=False)
     distribution = ground.nets.parametric_action_distribution

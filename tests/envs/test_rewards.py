@@ -22,6 +22,12 @@ def upright(step):
 def broken(step):
     return step.after.qpos[99] + missing
 
+def length(step):
+    return {"length": step.reward}
+
+def falling(step):
+    return {"reward_falling": step.reward * (step.dt < 1)}
+
 def vector(step):
     return {"reward_all": step.after.qpos}
 """
@@ -96,6 +102,8 @@ def test_training_with_an_own_reward_is_scored_by_gymnasium(own, tmp_path, monke
         row["episode/reward_height"] + row["episode/reward_forward"] + row["episode/reward_falling"], rel=1e-4
     )
     assert json.loads((tmp_path / "run" / "eval_gymnasium.json").read_text())["env"] == "Walker2d-v5"
+    own.unlink()  # neither the policy nor its score needs it
+    assert api.load_run("run").evaluate(1).env == "Walker2d-v5"
 
 
 @pytest.mark.parametrize(
@@ -106,15 +114,25 @@ def test_training_with_an_own_reward_is_scored_by_gymnasium(own, tmp_path, monke
         ("my_reward.py:missing", "has no function 'missing'"),
         ("my_reward.py:broken", "NameError: name 'missing' is not defined"),
         ("my_reward.py:vector", "must return a dict of scalars by name"),
+        ("my_reward.py:length", "the term's name 'length' does not begin with reward_"),
+        ("my_reward.py:falling", "the term's name 'reward_falling' is one of env.shaping's"),
     ],
 )
 def test_a_reward_function_that_does_not_work(own, tmp_path, monkeypatch, function, says):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError) as error:
-        make_env("walker2d", physics="c", reward_function=function)
+        make_env("walker2d", physics="c", reward_function=function, shaping={"falling": 1.0})
     assert says in str(error.value) and "\n" not in str(error.value)
 
 
-def test_no_y_in_a_plane():
-    with pytest.raises(UserError, match="walker2d has no y"):
-        make_env("walker2d", physics="c", shaping=Shaping(keep_y=1.0))
+@pytest.mark.parametrize(
+    ("name", "shaping", "says"),
+    [
+        ("walker2d", {"keep_y": 1.0}, "walker2d has no y"),
+        ("humanoid_standup", {"falling": 1.0}, "no fall ends an episode here"),
+        ("walker2d", {"faling": 1.0}, "unknown key 'env.shaping.faling'"),
+    ],
+)
+def test_shaping_that_would_do_nothing(name, shaping, says):
+    with pytest.raises(UserError, match=says):
+        make_env(name, physics="c", shaping=shaping)
