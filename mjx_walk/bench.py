@@ -204,7 +204,7 @@ def peer_figures(algo: str, hardware: str) -> list[tuple[str, float, str]]:
         ppo_sizes = (2048, 1024, 32, 30) if hardware == "gpu" else (32, 16, 2, 3)
         speed = peers.brax_ppo_speed(*ppo_sizes)
         return [(f"Brax's PPO on its reduced humanoid, {ppo_sizes[0]} copies", speed, "env-steps/s")]
-    sac_sizes = (128, 128, 32, 1_000_000, 300) if hardware == "gpu" else (16, 64, 16, 20_000, 20)
+    sac_sizes = (128, 512, 8, 1_000_000, 300) if hardware == "gpu" else (16, 64, 4, 20_000, 20)
     ours, theirs = peers.sac_update_speeds(*sac_sizes)
     return [
         ("our SAC on Brax's humanoid", ours, "updates/s"),
