@@ -136,6 +136,7 @@ def test_compare_runs_what_is_missing_and_keeps_the_rest(tmp_path):
     assert (tmp_path / "out" / "ppo" / "seed_0" / "metrics.jsonl").stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_an_interrupted_comparison_goes_on(tmp_path):
     arguments = ["algos=[a2c]", "seeds=1", "out=out", *SMALL, "checkpoint.every_chunks=1"]
     arguments[arguments.index("total_steps=512")] = "total_steps=20000"
