@@ -68,6 +68,11 @@ def shaping_terms(shaping: Shaping, step: RewardStep) -> Terms:
     return {f"reward_{name}": weights[name] * term() for name, term in terms.items() if weights[name]}
 
 
+def reward_file(source: str) -> Path:
+    """The file in `PATH.py:FUNCTION`."""
+    return Path(source.rpartition(":")[0]).expanduser()
+
+
 def load_reward_function(source: str) -> RewardFunction:
     """Load a function from a Python file.
 
@@ -77,11 +82,10 @@ def load_reward_function(source: str) -> RewardFunction:
     Raises:
         UserError: there is no such file or function, or the file cannot be run.
     """
-    path, _, name = source.rpartition(":")
-    path = str(Path(path).expanduser())
-    if not Path(path).is_file():
+    path, name = reward_file(source), source.rpartition(":")[2]
+    if not path.is_file():
         raise UserError(f"env.reward_function={source}: no file '{path}'; write PATH.py:FUNCTION")
-    spec = importlib.util.spec_from_file_location(Path(path).stem, path)
+    spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:
         raise UserError(f"env.reward_function={source}: '{path}' is not a Python file")
     module = importlib.util.module_from_spec(spec)

@@ -15,6 +15,7 @@ from mjx_walk.capacity import check_replay
 from mjx_walk.config import Config, compile_cache_dir, load_config, read_config
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.physics import resolve_engine
+from mjx_walk.envs.rewards import reward_file
 from mjx_walk.evaluation import Scores, score_in_gymnasium, score_in_sim
 from mjx_walk.loop import Trainer
 from mjx_walk.metrics import Row, read_rows
@@ -145,7 +146,7 @@ def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | 
 def _without_lost_reward(config: Config) -> Config:
     """Without a reward function whose file is not there any more: the policy and its score do not need it."""
     source = config.env.reward_function
-    if source is None or Path(source.rpartition(":")[0]).expanduser().is_file():
+    if source is None or reward_file(source).is_file():
         return config
     return dataclasses.replace(config, env=dataclasses.replace(config.env, reward_function=None))
 

@@ -16,12 +16,12 @@ from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from mjx_walk.config import Config, complete_overrides, flatten, load_config, read_config
+from mjx_walk.config import Config, complete_overrides, load_config, read_config
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.errors import UserError
 from mjx_walk.interrupt import Interrupt
 from mjx_walk.metrics import read_rows
-from mjx_walk.run_folder import MAY_DIFFER, RunFolder
+from mjx_walk.run_folder import RunFolder, differences
 
 _SECONDS_BETWEEN_REPORTS = 30.0
 _MEMORY_FRACTION = 0.75
@@ -217,9 +217,7 @@ def _check_same_configuration(cell: Cell) -> None:
     if not cell.folder.config.exists():
         return
     saved = read_config(cell.folder.config)
-    new = dataclasses.replace(cell.config, physics=resolve_engine(cell.config.physics))
-    old_settings, settings = flatten(saved), flatten(new)
-    differing = [key for key in settings if key not in MAY_DIFFER and old_settings.get(key) != settings[key]]
+    differing = differences(saved, dataclasses.replace(cell.config, physics=resolve_engine(cell.config.physics)))
     if cell.config.total_steps < saved.total_steps:
         differing.append("total_steps, which may only grow")
     if differing:

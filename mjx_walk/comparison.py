@@ -13,11 +13,11 @@ import scipy.stats
 from mjx_walk.config import Config, flatten, read_config
 from mjx_walk.errors import UserError
 from mjx_walk.metrics import Row, read_rows
+from mjx_walk.plots import AXES, series_of
 from mjx_walk.run_folder import RunFolder
 
 MIN_SEEDS_FOR_INTERVALS = 5
 _POINTS = 200
-_AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))
 _QUANTITIES = (("episode/return", "return"), ("episode/length", "episode length"))
 
 
@@ -117,19 +117,15 @@ def _settings(config: Config) -> dict:
     return {key: value for key, value in flatten(config).items() if key not in ("run_dir", "resume", "seed")}
 
 
-def _final_score(run: Curve) -> float | None:
-    return run.scores["mean"] if run.scores else None
-
-
 def _draw(groups: dict[str, list[Curve]], path: Path) -> None:
     figure = matplotlib.figure.Figure(figsize=(12, 8), layout="constrained")
     grid = figure.subplots(2, 2, sharex="col")
     for line, (quantity, title) in enumerate(_QUANTITIES):
-        for column, (axis, unit, label) in enumerate(_AXES):
+        for column, (axis, unit, label) in enumerate(AXES):
             plot = grid[line][column]
             for number, (name, runs) in enumerate(groups.items()):
-                curves = [_series(run.rows, axis, unit, quantity) for run in runs]
-                curves = [curve for curve in curves if len(curve[0])]
+                series = [series_of(run.rows, axis, quantity) for run in runs]
+                curves = [(np.array(xs) / unit, np.array(ys)) for xs, ys in series if xs]
                 if not curves:
                     continue
                 color = f"C{number % 10}"
@@ -151,11 +147,6 @@ def _draw(groups: dict[str, list[Curve]], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _series(rows: list[Row], axis: str, unit: float, quantity: str) -> tuple[np.ndarray, np.ndarray]:
-    pairs = [(row[axis] / unit, row[quantity]) for row in rows if row.get(quantity) is not None]
-    return np.array([x for x, _ in pairs]), np.array([y for _, y in pairs])
-
-
 def _markdown(groups: dict[str, list[Curve]]) -> str:
     lines = [
         "| variant | seeds | score in Gymnasium, mean over seeds | spread (std) | 95% interval | lowest seed "
@@ -163,7 +154,7 @@ def _markdown(groups: dict[str, list[Curve]]) -> str:
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name, runs in groups.items():
-        scores = np.array([score for run in runs if (score := _final_score(run)) is not None])
+        scores = np.array([run.scores["mean"] for run in runs if run.scores])
         bounds = interval(scores)
         cells = [
             name,

@@ -19,8 +19,8 @@ from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
 from mjx_walk.noise import OrnsteinUhlenbeck
-from mjx_walk.optimizers import make_adam
-from mjx_walk.schedules import anneal
+from mjx_walk.optimizers import descend, make_adam
+from mjx_walk.schedules import adapt_rate, anneal
 from mjx_walk.settings import setting
 from mjx_walk.types import Metrics, PolicyFn, Transition
 from mjx_walk.wrappers import VectorEnv, VectorState
@@ -42,7 +42,7 @@ class OnPolicyConfig:
     """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
     max_policy_grad_norm: float = setting(1.0, above=0)
     max_value_grad_norm: float | None = setting(None, above=0)
-    """By default policy and value are clipped together by `max_policy_grad_norm`, as Brax does."""
+    """Unset, `max_policy_grad_norm` clips policy and value together, as Brax does."""
     discount: float = setting(0.97, at_least=0, at_most=1)
     gae_lambda: float = setting(0.95, at_least=0, at_most=1)
     entropy_cost: float = setting(1e-3, at_least=0)
@@ -70,6 +70,10 @@ class OnPolicyConfig:
     stagger_episodes: bool = True
 
 
+Learned = tuple[ppo_losses.PPONetworkParams, optax.OptState, jax.Array]
+"""What gradient steps change: parameters, the optimizer's state and the learning rate."""
+
+
 class OnPolicyState(flax.struct.PyTreeNode):
     """Everything that influences the next update."""
 
@@ -85,6 +89,18 @@ class OnPolicyState(flax.struct.PyTreeNode):
     key: jax.Array
     updates: jax.Array
     """`[] i32`: updates done."""
+
+    def after_update(self, learned: Learned, normalizer: RunningStatisticsState, key: jax.Array) -> "OnPolicyState":
+        """With what an update has changed."""
+        params, optimizer, learning_rate = learned
+        return self.replace(
+            params=params,
+            optimizer=optimizer,
+            learning_rate=learning_rate,
+            normalizer=normalizer,
+            key=key,
+            updates=self.updates + 1,
+        )
 
 
 class OnPolicyBatch(flax.struct.PyTreeNode):
@@ -231,6 +247,31 @@ def make_on_policy(
         return anneal(state.updates * float(steps_per_update), config.schedule_steps)
 
     return OnPolicyGround(nets, optimizer, init, collect, policy_params, policy, steps_per_update, remaining)
+
+
+def normalizers(
+    config: OnPolicyConfig, state: OnPolicyState, batch: OnPolicyBatch
+) -> tuple[RunningStatisticsState, RunningStatisticsState]:
+    """The observation normalizers to learn with and to go on with.
+
+    KL compares distributions under one normalizer, the one that acted, so with `adaptive_kl` it moves after the update.
+    """
+    new = networks.update_normalizer(state.normalizer, batch.transitions.observation)
+    return (state.normalizer if config.learning_rate_schedule == "adaptive_kl" else new), new
+
+
+def gradient_step(
+    ground: OnPolicyGround,
+    config: OnPolicyConfig,
+    learned: Learned,
+    grads: Any,
+    kl: jax.Array,
+    rate_factor: jax.Array | float,
+) -> Learned:
+    """One step down the gradient of a minibatch, at a rate that follows the KL where it is to adapt."""
+    params, opt_state, rate = learned
+    rate = adapt_rate(rate, kl, config.target_kl) if config.learning_rate_schedule == "adaptive_kl" else rate
+    return (*descend(ground.optimizer, params, grads, opt_state, rate * rate_factor), rate)
 
 
 def require_whole_minibatches(num_envs: int, num_unrolls: int, num_minibatches: int) -> None:

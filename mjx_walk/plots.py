@@ -6,7 +6,8 @@ import matplotlib.figure
 
 from mjx_walk.metrics import Row, read_rows
 
-_AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))
+AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))
+"""What curves are drawn against: the key of a row, its unit, its label."""
 
 
 def plot_run(run_dir: Path) -> list[Path]:
@@ -28,7 +29,8 @@ def plot_run(run_dir: Path) -> list[Path]:
     ]
 
 
-def _series(rows: list[Row], x: str, y: str) -> tuple[list[float], list[float]]:
+def series_of(rows: list[Row], x: str, y: str) -> tuple[list[float], list[float]]:
+    """The values of `x` and `y` in those rows that have the latter."""
     pairs = [(row[x], row[y]) for row in rows if row.get(y) is not None]
     return [p[0] for p in pairs], [p[1] for p in pairs]
 
@@ -36,12 +38,12 @@ def _series(rows: list[Row], x: str, y: str) -> tuple[list[float], list[float]]:
 def _learning_curve(rows: list[Row], path: Path) -> Path:
     figure = matplotlib.figure.Figure(figsize=(10, 6.5), layout="constrained")
     grid = figure.subplots(2, 2, sharex="col")
-    for column, (axis, unit, label) in enumerate(_AXES):
+    for column, (axis, unit, label) in enumerate(AXES):
         for line, (quantity, title) in enumerate((("return", "return"), ("length", "episode length"))):
             plot = grid[line][column]
             for source, style in (("episode", {"alpha": 0.6}), ("eval", {"marker": "o", "markersize": 4})):
                 is_eval = source == "eval" and axis == "env_steps"
-                xs, ys = _series(rows, "eval/env_steps" if is_eval else axis, f"{source}/{quantity}")
+                xs, ys = series_of(rows, "eval/env_steps" if is_eval else axis, f"{source}/{quantity}")
                 if xs:
                     name = {"episode": "while training", "eval": "deterministic evaluation"}[source]
                     plot.plot([x / unit for x in xs], ys, label=name, **style)
@@ -62,7 +64,7 @@ def _grid(rows: list[Row], names: list[str], ylabel: str, path: Path) -> Path:
     for unused in plots[len(names) :]:
         unused.set_axis_off()
     for plot, name in zip(plots, names, strict=False):
-        xs, ys = _series(rows, "env_steps", name)
+        xs, ys = series_of(rows, "env_steps", name)
         plot.plot([x / 1e6 for x in xs], ys)
         plot.set_title(name.partition("/")[2], fontsize=9)
         plot.set_xlabel("million steps", fontsize=8)

@@ -1,5 +1,6 @@
 """How A2C and REINFORCE learn: a batch is gone through once, by the plain policy gradient."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -8,21 +9,50 @@ import jax.numpy as jnp
 import optax
 from brax.training.acme.running_statistics import RunningStatisticsState
 
-from mjx_walk import networks
 from mjx_walk.errors import UserError
-from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyGround, OnPolicyState
-from mjx_walk.optimizers import descend
-from mjx_walk.schedules import adapt_rate, factor
+from mjx_walk.on_policy import (
+    OnPolicyBatch,
+    OnPolicyConfig,
+    OnPolicyGround,
+    OnPolicyState,
+    gradient_step,
+    normalizers,
+    require_whole_minibatches,
+)
+from mjx_walk.schedules import factor
+from mjx_walk.settings import setting
 from mjx_walk.types import Metrics
+
+
+@dataclasses.dataclass
+class PolicyGradientConfig(OnPolicyConfig):
+    """Settings that both have."""
+
+    distribution: str = setting("normal", choices=("tanh_normal", "normal"))
+    """Squashed, it runs away: nothing holds the mean back where tanh is flat."""
+    num_unrolls: int = setting(1, at_least=1)
+    num_minibatches: int = setting(1, at_least=1)
+    """Gradient steps on a batch, each on pieces of its own."""
+
+
+def check_minibatches(num_envs: int, config: PolicyGradientConfig) -> None:
+    """Check that a batch can be learned from as the settings say.
+
+    Raises:
+        UserError: its pieces do not divide into the minibatches; or the rate is to adapt to the KL, of which a single
+            gradient step knows nothing.
+    """
+    require_whole_minibatches(num_envs, config.num_unrolls, config.num_minibatches)
+    if config.learning_rate_schedule == "adaptive_kl" and config.num_minibatches == 1:
+        raise UserError("algo.learning_rate_schedule=adaptive_kl needs algo.num_minibatches of 2 or more")
 
 
 def learn_once(
     ground: OnPolicyGround,
-    config: OnPolicyConfig,
+    config: PolicyGradientConfig,
     state: OnPolicyState,
     batch: OnPolicyBatch,
     data: Any,
-    num_minibatches: int,
     loss: Callable[[Any, RunningStatisticsState, Any, jax.Array, jax.Array], tuple[jax.Array, Metrics]],
 ) -> tuple[OnPolicyState, Metrics]:
     """One pass over a batch in minibatches, each piece used for one gradient step.
@@ -33,50 +63,31 @@ def learn_once(
         state: before.
         batch: as collected.
         data: what the loss reads of it; a tree of `[N, …]`.
-        num_minibatches: gradient steps.
         loss: `(params, normalizer, data of a minibatch, entropy cost, key)` to `(loss, metrics)`, among them `kl`.
 
     Returns:
         The state after it, and all metrics.
-
-    Raises:
-        UserError: a rate that adapts to the KL, of which a single gradient step knows nothing.
     """
-    is_adaptive = config.learning_rate_schedule == "adaptive_kl"
-    if is_adaptive and num_minibatches == 1:
-        raise UserError("algo.learning_rate_schedule=adaptive_kl needs algo.num_minibatches of 2 or more")
     key, shuffle_key, loss_key = jax.random.split(state.key, 3)
     remaining = ground.remaining(state)
     rate_factor = factor(config.learning_rate_schedule, remaining)
     entropy_cost = config.entropy_cost * factor(config.entropy_schedule, remaining)
-    # The policy that acted had the old normalizer, which its KL is to be measured under.
-    new_normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
-    normalizer = state.normalizer if is_adaptive else new_normalizer
+    normalizer, new_normalizer = normalizers(config, state, batch)
 
     def minibatch(carry, inputs):
-        params, opt_state, rate = carry
         rows, key = inputs
         part = jax.tree.map(lambda x: x[rows], data)
-        grads, metrics = jax.grad(loss, has_aux=True)(params, normalizer, part, entropy_cost, key)
+        grads, metrics = jax.grad(loss, has_aux=True)(carry[0], normalizer, part, entropy_cost, key)
         metrics |= {"grad_norm": optax.global_norm(grads)}
-        if is_adaptive:
-            rate = adapt_rate(rate, metrics["kl"], config.target_kl)
-        return (*descend(ground.optimizer, params, grads, opt_state, rate * rate_factor), rate), metrics
+        return gradient_step(ground, config, carry, grads, metrics["kl"], rate_factor), metrics
 
-    rows = jax.random.permutation(shuffle_key, batch.transitions.reward.shape[0]).reshape((num_minibatches, -1))
-    keys = jax.random.split(loss_key, num_minibatches)
+    rows = jax.random.permutation(shuffle_key, batch.transitions.reward.shape[0]).reshape((config.num_minibatches, -1))
+    keys = jax.random.split(loss_key, config.num_minibatches)
     carry = (state.params, state.optimizer, state.learning_rate)
-    (params, opt_state, rate), metrics = jax.lax.scan(minibatch, carry, (rows, keys))
-    new_state = state.replace(
-        params=params,
-        optimizer=opt_state,
-        learning_rate=rate,
-        normalizer=new_normalizer,
-        key=key,
-        updates=state.updates + 1,
-    )
+    learned, metrics = jax.lax.scan(minibatch, carry, (rows, keys))
+    new_state = state.after_update(learned, new_normalizer, key)
     return new_state, batch.stats | jax.tree.map(jnp.mean, metrics) | {
-        "learning_rate": jnp.float32(rate * rate_factor),
+        "learning_rate": jnp.float32(new_state.learning_rate * rate_factor),
         "reward_scale": batch.reward_scale,
     }
 

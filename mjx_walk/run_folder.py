@@ -81,14 +81,19 @@ def prepare(config: Config) -> tuple[RunFolder, Config]:
     return folder, config
 
 
-def _check_same_run(folder: RunFolder, config: Config) -> Config:
-    saved = read_config(folder.config)
+def differences(saved: Config, config: Config) -> list[str]:
+    """The settings in which a run differs from what is asked for now, beside those that may."""
     old, new = flatten(saved), flatten(config)
-    differing = [
+    return [
         f"{key} (was {old.get(key)}, now {new.get(key)})"
         for key in sorted(old.keys() | new.keys())
         if key not in MAY_DIFFER and old.get(key) != new.get(key)
     ]
+
+
+def _check_same_run(folder: RunFolder, config: Config) -> Config:
+    saved = read_config(folder.config)
+    differing = differences(saved, config)
     if differing:
         raise UserError(f"resume=true with another configuration than {folder.config}: {'; '.join(differing)}")
     if config.total_steps < saved.total_steps:

@@ -88,9 +88,8 @@ def test_sampled_kl_is_that_of_two_gaussians():
 
 
 def test_adaptive_rate_needs_several_minibatches():
-    _, algorithm, state, batch = collected(RewardedAction(), learning_rate_schedule="adaptive_kl")
     with pytest.raises(UserError, match=r"needs algo\.num_minibatches of 2 or more"):
-        algorithm.learn(state, batch)
+        collected(RewardedAction(), learning_rate_schedule="adaptive_kl")
 
 
 def test_adaptive_rate_falls_where_the_policy_moves_too_fast():

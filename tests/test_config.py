@@ -40,6 +40,8 @@ def test_the_reports_recipes_name_their_own_task_and_algorithm(name):
     )
     algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
     assert algorithm.steps_per_update * config.updates_per_chunk < config.total_steps / 20
+    if name in ("c_sac", "d_ddpg", "d_sac", "e_td3"):
+        assert config.evaluation.num_envs == 10 and algorithm.steps_per_update == config.num_envs
 
 
 def test_the_first_reports_observation_has_378_numbers():

@@ -9,28 +9,17 @@ from brax.training.agents.ppo import losses as ppo_losses
 from mjx_walk.envs import Task
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.noise import OrnsteinUhlenbeck
-from mjx_walk.on_policy import (
-    OnPolicyBatch,
-    OnPolicyConfig,
-    OnPolicyState,
-    make_on_policy,
-    require_whole_minibatches,
-)
-from mjx_walk.policy_gradient import learn_once, sampled_kl
+from mjx_walk.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
+from mjx_walk.policy_gradient import PolicyGradientConfig, check_minibatches, learn_once, sampled_kl
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
 
 @dataclasses.dataclass
-class A2CConfig(OnPolicyConfig):
+class A2CConfig(PolicyGradientConfig):
     """Settings of A2C; the recipe of each task changes some of them."""
 
     name: str = setting("a2c", choices=("a2c",))
-    distribution: str = setting("normal", choices=("tanh_normal", "normal"))
-    """Squashed, it runs away: nothing holds the mean back where tanh is flat."""
-    num_unrolls: int = setting(1, at_least=1)
-    num_minibatches: int = setting(1, at_least=1)
-    """Gradient steps on a batch, each on pieces of its own."""
     ou_noise_std: float = setting(0.0, at_least=0)
     """Ornstein-Uhlenbeck noise added to actions in [-1, 1]: the std of its kicks."""
     ou_noise_theta: float = setting(0.15, above=0, at_most=1)
@@ -47,9 +36,9 @@ def make_a2c(task: Task, num_envs: int, evaluation: EvaluationConfig, config: A2
         config: settings; `gae_lambda=0` gives the one-step temporal difference as advantage.
 
     Raises:
-        UserError: the batch does not divide into the minibatches.
+        UserError: see `check_minibatches`.
     """
-    require_whole_minibatches(num_envs, config.num_unrolls, config.num_minibatches)
+    check_minibatches(num_envs, config)
     exploration = OrnsteinUhlenbeck(config.ou_noise_std, config.ou_noise_theta) if config.ou_noise_std else None
     ground = make_on_policy(task, num_envs, evaluation, config, exploration=exploration)
     policy_network, value_network = ground.nets.policy_network, ground.nets.value_network
@@ -84,6 +73,6 @@ def make_a2c(task: Task, num_envs: int, evaluation: EvaluationConfig, config: A2
 
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         data = batch.transitions._replace(reward=batch.transitions.reward * batch.reward_scale)
-        return learn_once(ground, config, state, batch, data, config.num_minibatches, loss)
+        return learn_once(ground, config, state, batch, data, loss)
 
     return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)

@@ -8,12 +8,18 @@ import jax.numpy as jnp
 import optax
 from brax.training.agents.ppo import losses as ppo_losses
 
-from mjx_walk import networks
 from mjx_walk.envs import Task
 from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy, require_whole_minibatches
-from mjx_walk.optimizers import descend
-from mjx_walk.schedules import adapt_rate, factor
+from mjx_walk.on_policy import (
+    OnPolicyBatch,
+    OnPolicyConfig,
+    OnPolicyState,
+    gradient_step,
+    make_on_policy,
+    normalizers,
+    require_whole_minibatches,
+)
+from mjx_walk.schedules import factor
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -42,16 +48,13 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
     """
     require_whole_minibatches(num_envs, config.num_unrolls, config.num_minibatches)
     ground = make_on_policy(task, num_envs, evaluation, config)
-    nets, optimizer = ground.nets, ground.optimizer
+    nets = ground.nets
 
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         key, update_key = jax.random.split(state.key)
         remaining = ground.remaining(state)
-        is_adaptive = config.learning_rate_schedule == "adaptive_kl"
         rate_factor = factor(config.learning_rate_schedule, remaining)
-        # KL compares distributions under one normalizer, so with adaptive_kl it moves after the update.
-        new_normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
-        normalizer = state.normalizer if is_adaptive else new_normalizer
+        normalizer, new_normalizer = normalizers(config, state, batch)
         loss_fn = functools.partial(
             ppo_losses.compute_ppo_loss,
             ppo_network=nets,
@@ -65,39 +68,30 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
         )
 
         def minibatch(carry, rows):
-            params, opt_state, rate, key = carry
+            learned, key = carry
             key, loss_key = jax.random.split(key)
             data = jax.tree.map(lambda x: x[rows], batch.transitions)
-            grads, metrics = jax.grad(loss_fn, has_aux=True)(params, normalizer, data, loss_key)
-            if is_adaptive:
-                rate = adapt_rate(rate, metrics["kl_mean"], config.target_kl)
+            grads, metrics = jax.grad(loss_fn, has_aux=True)(learned[0], normalizer, data, loss_key)
             metrics["grad_norm"] = optax.global_norm(grads)
-            params, opt_state = descend(optimizer, params, grads, opt_state, rate * rate_factor)
-            return (params, opt_state, rate, key), metrics
+            learned = gradient_step(ground, config, learned, grads, metrics["kl_mean"], rate_factor)
+            return (learned, key), metrics
 
         def epoch(carry, _):
-            params, opt_state, rate, key = carry
+            learned, key = carry
             key, shuffle_key, epoch_key = jax.random.split(key, 3)
             rows = jax.random.permutation(shuffle_key, batch.transitions.reward.shape[0])
-            carry = (params, opt_state, rate, epoch_key)
-            carry, metrics = jax.lax.scan(minibatch, carry, rows.reshape((config.num_minibatches, -1)))
-            return (*carry[:3], key), metrics
+            carry = (learned, epoch_key)
+            (learned, _), metrics = jax.lax.scan(minibatch, carry, rows.reshape((config.num_minibatches, -1)))
+            return (learned, key), metrics
 
-        carry = (state.params, state.optimizer, state.learning_rate, update_key)
-        (params, opt_state, rate, _), metrics = jax.lax.scan(epoch, carry, length=config.num_epochs)
-        new_state = state.replace(
-            params=params,
-            optimizer=opt_state,
-            learning_rate=rate,
-            normalizer=new_normalizer,
-            key=key,
-            updates=state.updates + 1,
-        )
+        carry = ((state.params, state.optimizer, state.learning_rate), update_key)
+        (learned, _), metrics = jax.lax.scan(epoch, carry, length=config.num_epochs)
+        new_state = state.after_update(learned, new_normalizer, key)
         acted_with = batch.transitions.extras["policy_extras"]["distribution_params"]
         # The entropy is only told, so it may borrow the next update's key.
         return new_state, batch.stats | _loss_metrics(metrics) | {
             "entropy": nets.parametric_action_distribution.entropy(acted_with, key).mean(),
-            "learning_rate": jnp.float32(rate * rate_factor),
+            "learning_rate": jnp.float32(new_state.learning_rate * rate_factor),
             "reward_scale": batch.reward_scale,
         }
 

@@ -9,30 +9,19 @@ from mjx_walk import returns
 from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.on_policy import (
-    OnPolicyBatch,
-    OnPolicyConfig,
-    OnPolicyState,
-    make_on_policy,
-    require_whole_minibatches,
-)
-from mjx_walk.policy_gradient import learn_once, sampled_kl
+from mjx_walk.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
+from mjx_walk.policy_gradient import PolicyGradientConfig, check_minibatches, learn_once, sampled_kl
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
 
 @dataclasses.dataclass
-class REINFORCEConfig(OnPolicyConfig):
+class REINFORCEConfig(PolicyGradientConfig):
     """Settings of REINFORCE; the recipe of each task changes some of them. Those for advantages and values do nothing
     here."""
 
     name: str = setting("reinforce", choices=("reinforce",))
-    distribution: str = setting("normal", choices=("tanh_normal", "normal"))
-    """Squashed, it runs away: nothing holds the mean back where tanh is flat."""
     unroll_length: int = setting(256, at_least=1)
-    num_unrolls: int = setting(1, at_least=1)
-    num_minibatches: int = setting(1, at_least=1)
-    """Gradient steps on a batch, each on copies of its own."""
     max_unseen: float = setting(0.05, above=0, at_most=1)
     """Steps whose return leaves out a future that would count more than this are not learned from."""
 
@@ -50,7 +39,7 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
         config: settings.
 
     Raises:
-        UserError: the batch does not divide into the minibatches, or its pieces are too short to learn from.
+        UserError: see `check_minibatches`; or the pieces are too short to learn from.
     """
     unseen_at_best = config.discount**config.unroll_length
     if unseen_at_best > config.max_unseen:
@@ -58,7 +47,7 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
             f"algo.unroll_length={config.unroll_length}: what follows a piece counts {unseen_at_best:.2f} at its first "
             f"step, above algo.max_unseen={config.max_unseen}; lengthen it, or lower algo.discount"
         )
-    require_whole_minibatches(num_envs, config.num_unrolls, config.num_minibatches)
+    check_minibatches(num_envs, config)
     ground = make_on_policy(task, num_envs, evaluation, config, has_value=False)
     distribution = ground.nets.parametric_action_distribution
 
@@ -82,7 +71,7 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
         )
         weight = jnp.float32(config.max_unseen >= unseen.T)
         data = (transitions, _normalize(return_to_go.T * batch.reward_scale, weight), weight)
-        new_state, metrics = learn_once(ground, config, state, batch, data, config.num_minibatches, loss)
+        new_state, metrics = learn_once(ground, config, state, batch, data, loss)
         return new_state, metrics | {"learned_from": weight.mean()}
 
     return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)
