@@ -19,7 +19,7 @@ from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
 from mjx_walk.noise import OrnsteinUhlenbeck
-from mjx_walk.optimizers import descend, make_adam
+from mjx_walk.optimizers import make_adam
 from mjx_walk.schedules import adapt_rate, anneal
 from mjx_walk.settings import setting
 from mjx_walk.types import Metrics, PolicyFn, Transition
@@ -36,7 +36,8 @@ class OnPolicyConfig:
     """Pieces of every copy in one batch."""
     learning_rate: float = setting(3e-4, above=0)
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
-    """`linear`: to zero over `schedule_steps`; `adaptive_kl`: kept near `target_kl`, and annealed as well."""
+    """`linear`: to zero over `schedule_steps`; `adaptive_kl`: adapted after each batch so that the policy has moved by
+    about `target_kl` at its end, and annealed as well."""
     target_kl: float = setting(0.01, above=0)
     schedule_steps: int = setting(100_000_000, at_least=1)
     """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
@@ -70,10 +71,6 @@ class OnPolicyConfig:
     stagger_episodes: bool = True
 
 
-Learned = tuple[ppo_losses.PPONetworkParams, optax.OptState, jax.Array]
-"""What gradient steps change: parameters, the optimizer's state and the learning rate."""
-
-
 class OnPolicyState(flax.struct.PyTreeNode):
     """Everything that influences the next update."""
 
@@ -89,18 +86,6 @@ class OnPolicyState(flax.struct.PyTreeNode):
     key: jax.Array
     updates: jax.Array
     """`[] i32`: updates done."""
-
-    def after_update(self, learned: Learned, normalizer: RunningStatisticsState, key: jax.Array) -> "OnPolicyState":
-        """With what an update has changed."""
-        params, optimizer, learning_rate = learned
-        return self.replace(
-            params=params,
-            optimizer=optimizer,
-            learning_rate=learning_rate,
-            normalizer=normalizer,
-            key=key,
-            updates=self.updates + 1,
-        )
 
 
 class OnPolicyBatch(flax.struct.PyTreeNode):
@@ -249,29 +234,27 @@ def make_on_policy(
     return OnPolicyGround(nets, optimizer, init, collect, policy_params, policy, steps_per_update, remaining)
 
 
-def normalizers(
-    config: OnPolicyConfig, state: OnPolicyState, batch: OnPolicyBatch
-) -> tuple[RunningStatisticsState, RunningStatisticsState]:
-    """The observation normalizers to learn with and to go on with.
-
-    KL compares distributions under one normalizer, the one that acted, so with `adaptive_kl` it moves after the update.
-    """
-    new = networks.update_normalizer(state.normalizer, batch.transitions.observation)
-    return (state.normalizer if config.learning_rate_schedule == "adaptive_kl" else new), new
-
-
-def gradient_step(
-    ground: OnPolicyGround,
+def after_update(
     config: OnPolicyConfig,
-    learned: Learned,
-    grads: Any,
+    state: OnPolicyState,
+    params: ppo_losses.PPONetworkParams,
+    optimizer: optax.OptState,
+    normalizer: RunningStatisticsState,
     kl: jax.Array,
-    rate_factor: jax.Array | float,
-) -> Learned:
-    """One step down the gradient of a minibatch, at a rate that follows the KL where it is to adapt."""
-    params, opt_state, rate = learned
-    rate = adapt_rate(rate, kl, config.target_kl) if config.learning_rate_schedule == "adaptive_kl" else rate
-    return (*descend(ground.optimizer, params, grads, opt_state, rate * rate_factor), rate)
+    key: jax.Array,
+) -> OnPolicyState:
+    """`state` with what an update has changed, and a learning rate that follows the KL it ended at if it is to."""
+    rate = state.learning_rate
+    if config.learning_rate_schedule == "adaptive_kl":
+        rate = adapt_rate(rate, kl, config.target_kl)
+    return state.replace(
+        params=params,
+        optimizer=optimizer,
+        learning_rate=rate,
+        normalizer=normalizer,
+        key=key,
+        updates=state.updates + 1,
+    )
 
 
 def require_whole_minibatches(num_envs: int, num_unrolls: int, num_minibatches: int) -> None:

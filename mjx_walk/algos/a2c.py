@@ -10,7 +10,13 @@ from mjx_walk.envs import Task
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.noise import OrnsteinUhlenbeck
 from mjx_walk.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
-from mjx_walk.policy_gradient import PolicyGradientConfig, check_minibatches, learn_once, sampled_kl
+from mjx_walk.policy_gradient import (
+    PolicyGradientConfig,
+    check_minibatches,
+    learn_once,
+    policy_gradient_loss,
+    sampled_kl,
+)
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -65,11 +71,12 @@ def make_a2c(task: Task, num_envs: int, evaluation: EvaluationConfig, config: A2
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         log_prob = distribution.log_prob(logits, data.extras["policy_extras"]["raw_action"])
         entropy = distribution.entropy(logits, key).mean()
-        policy_loss = -(advantages * log_prob).mean()
+        acted_log_prob = data.extras["policy_extras"]["log_prob"]
+        policy_loss = policy_gradient_loss(log_prob, acted_log_prob, advantages).mean()
         value_loss = jnp.square(targets - values).mean()
         total = policy_loss + config.value_cost * value_loss - entropy_cost * entropy
         metrics = {"loss": total, "policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
-        return total, metrics | {"kl": sampled_kl(log_prob, data.extras["policy_extras"]["log_prob"])}
+        return total, metrics | {"kl": sampled_kl(log_prob, acted_log_prob)}
 
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         data = batch.transitions._replace(reward=batch.transitions.reward * batch.reward_scale)

@@ -8,17 +8,18 @@ import jax.numpy as jnp
 import optax
 from brax.training.agents.ppo import losses as ppo_losses
 
+from mjx_walk import networks
 from mjx_walk.envs import Task
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.on_policy import (
     OnPolicyBatch,
     OnPolicyConfig,
     OnPolicyState,
-    gradient_step,
+    after_update,
     make_on_policy,
-    normalizers,
     require_whole_minibatches,
 )
+from mjx_walk.optimizers import descend
 from mjx_walk.schedules import factor
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
@@ -53,8 +54,10 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         key, update_key = jax.random.split(state.key)
         remaining = ground.remaining(state)
-        rate_factor = factor(config.learning_rate_schedule, remaining)
-        normalizer, new_normalizer = normalizers(config, state, batch)
+        rate = state.learning_rate * factor(config.learning_rate_schedule, remaining)
+        new_normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
+        # KL compares distributions under one normalizer, the one that acted.
+        normalizer = state.normalizer if config.learning_rate_schedule == "adaptive_kl" else new_normalizer
         loss_fn = functools.partial(
             ppo_losses.compute_ppo_loss,
             ppo_network=nets,
@@ -68,30 +71,30 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
         )
 
         def minibatch(carry, rows):
-            learned, key = carry
+            params, opt_state, key = carry
             key, loss_key = jax.random.split(key)
             data = jax.tree.map(lambda x: x[rows], batch.transitions)
-            grads, metrics = jax.grad(loss_fn, has_aux=True)(learned[0], normalizer, data, loss_key)
+            grads, metrics = jax.grad(loss_fn, has_aux=True)(params, normalizer, data, loss_key)
             metrics["grad_norm"] = optax.global_norm(grads)
-            learned = gradient_step(ground, config, learned, grads, metrics["kl_mean"], rate_factor)
-            return (learned, key), metrics
+            return (*descend(ground.optimizer, params, grads, opt_state, rate), key), metrics
 
         def epoch(carry, _):
-            learned, key = carry
+            params, opt_state, key = carry
             key, shuffle_key, epoch_key = jax.random.split(key, 3)
             rows = jax.random.permutation(shuffle_key, batch.transitions.reward.shape[0])
-            carry = (learned, epoch_key)
-            (learned, _), metrics = jax.lax.scan(minibatch, carry, rows.reshape((config.num_minibatches, -1)))
-            return (learned, key), metrics
+            carry = (params, opt_state, epoch_key)
+            (params, opt_state, _), metrics = jax.lax.scan(minibatch, carry, rows.reshape((config.num_minibatches, -1)))
+            return (params, opt_state, key), metrics
 
-        carry = ((state.params, state.optimizer, state.learning_rate), update_key)
-        (learned, _), metrics = jax.lax.scan(epoch, carry, length=config.num_epochs)
-        new_state = state.after_update(learned, new_normalizer, key)
+        carry = (state.params, state.optimizer, update_key)
+        (params, optimizer, _), metrics = jax.lax.scan(epoch, carry, length=config.num_epochs)
+        kl = metrics["kl_mean"][-1, -1]
+        new_state = after_update(config, state, params, optimizer, new_normalizer, kl, key)
         acted_with = batch.transitions.extras["policy_extras"]["distribution_params"]
         # The entropy is only told, so it may borrow the next update's key.
         return new_state, batch.stats | _loss_metrics(metrics) | {
             "entropy": nets.parametric_action_distribution.entropy(acted_with, key).mean(),
-            "learning_rate": jnp.float32(new_state.learning_rate * rate_factor),
+            "learning_rate": jnp.float32(rate),
             "reward_scale": batch.reward_scale,
         }
 

@@ -1,0 +1,48 @@
+"""REINFORCE: its loss worked out by hand, over the steps that it is to learn from."""
+
+import jax
+import numpy as np
+import pytest
+from toy_tasks import DelayedReward, EndlessReward
+
+from mjx_walk import networks
+from mjx_walk.algos.reinforce import REINFORCEConfig, make_reinforce
+from mjx_walk.live_evaluation import EvaluationConfig
+
+NUM_ENVS, STEPS, LEARNED = 16, 6, 4
+# What follows the piece counts 0.5³ at the fourth step and 0.5² at the fifth.
+SETTINGS = {"unroll_length": STEPS, "discount": 0.5, "max_unseen": 0.2, "policy_hidden_layer_sizes": (8,)}
+
+
+def learned(task, **changes):
+    """Config, state, batch and metrics of one update."""
+    config = REINFORCEConfig(**SETTINGS, **changes)
+    algorithm = make_reinforce(task, NUM_ENVS, EvaluationConfig(1), config)
+    state, batch = jax.jit(algorithm.collect)(jax.jit(algorithm.init)(jax.random.PRNGKey(0)))
+    return config, state, batch, jax.jit(algorithm.learn)(state, batch)[1]
+
+
+def test_loss_over_the_steps_whose_future_was_seen():
+    """Episodes that end at a piece's last steps are no reason to learn from these."""
+    config, state, batch, metrics = learned(DelayedReward(), stagger_episodes=False)
+    steps, nets = batch.transitions, networks.make_ppo_networks(DelayedReward(), config)
+    assert (np.asarray(steps.discount)[:, LEARNED:] == 0.0).any()
+    obs = np.asarray(steps.observation)[:, :LEARNED]
+    return_to_go = np.where(obs[..., 0] == 1.0, 1.0, 0.5)
+    advantage = (return_to_go - return_to_go.mean()) / return_to_go.std()
+    mean, std = map(np.asarray, nets.policy_network.apply(state.normalizer, state.params.policy, obs))
+    action = np.asarray(steps.extras["policy_extras"]["raw_action"])[:, :LEARNED]
+    log_prob = (-0.5 * ((action - mean) / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi)).sum(axis=-1)
+    assert metrics["policy_loss"] == pytest.approx(-(advantage * log_prob).mean(), rel=1e-3)
+    assert metrics["learned_from"] == pytest.approx(LEARNED / STEPS)
+
+
+def test_steps_just_before_a_time_limit_are_left_out():
+    """Of a limit of six steps, whose start is staggered, four of six may learn at any place of a piece."""
+    _, _, batch, metrics = learned(EndlessReward(6))
+    cut = np.asarray(batch.transitions.extras["state_extras"]["truncation"]) > 0.0
+    seen = np.ones((NUM_ENVS, LEARNED), bool)
+    for t in range(LEARNED):
+        seen[:, t] = ~cut[:, t : t + 2].any(axis=1)  # at two steps from the cut, the future counts 0.25
+    assert 0 < seen.sum() < seen.size
+    assert metrics["learned_from"] == pytest.approx(seen.sum() / (NUM_ENVS * STEPS))
