@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import flax
 import jax
 import jax.numpy as jnp
+from brax.training.acme import running_statistics
 from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.networks import ACTIVATION
 
@@ -69,24 +70,23 @@ class Batch(NamedTuple):
     """What a learner learns from, and with which settings of the moment."""
 
     transitions: Transition
-    """`[N, …]`, see `ReplayBuffer.sample`; actions in `[-1, 1]`."""
-    normalizer: RunningStatisticsState
+    """`[N, …]`, see `ReplayBuffer.sample`; observations normalised, actions in `[-1, 1]`."""
     reward_scale: jax.Array
     rate_factor: jax.Array | float
     """The learning rates' share that is left."""
 
 
 class Learner(NamedTuple):
-    """The networks of an algorithm, their losses and updates."""
+    """The networks of an algorithm, their losses and updates. All observations that it sees are normalised."""
 
     init: Callable[[jax.Array], Any]
     """`key → state`."""
     policy_params: Callable[[Any], Any]
     """The part of the state that the policy needs."""
     explore: Callable[[Any, jax.Array, jax.Array], jax.Array]
-    """`((normalizer, policy_params), obs [B, …], key) → action [B, action_size]`, in `[-1, 1]`, with noise."""
+    """`(policy_params, obs [B, …], key) → action [B, action_size]`, in `[-1, 1]`, with noise."""
     act: Callable[[Any, jax.Array, jax.Array, bool], jax.Array]
-    """`((normalizer, policy_params), obs, key, deterministic) → action`, in `[-1, 1]`."""
+    """`(policy_params, obs, key, deterministic) → action`, in `[-1, 1]`."""
     critic_update: Callable[[Any, Batch, jax.Array], tuple[Any, Metrics]]
     """`(state, batch, key) → (state, metrics)`, leaving the policy as it is."""
     full_update: Callable[[Any, Batch, jax.Array], tuple[Any, Metrics]]
@@ -140,8 +140,16 @@ def make_off_policy(
         )
     rows_before_learning = max(-(-config.prefill_steps // num_envs), config.n_step + 1)
 
+    def normalize(normalizer: RunningStatisticsState, obs: jax.Array) -> jax.Array:
+        return running_statistics.normalize(obs, normalizer, max_abs_value=config.observation_clip)
+
     def policy(policy_params: Any, deterministic: bool = True) -> PolicyFn:
-        return lambda obs, key: networks.to_env_action(task, learner.act(policy_params, obs, key, deterministic))
+        normalizer, params = policy_params
+
+        def act(obs: jax.Array, key: jax.Array) -> jax.Array:
+            return networks.to_env_action(task, learner.act(params, normalize(normalizer, obs), key, deterministic))
+
+        return act
 
     def policy_params(state: OffPolicyState) -> Any:
         return (state.normalizer, learner.policy_params(state.learner))
@@ -170,11 +178,11 @@ def make_off_policy(
         step = state.updates * config.unroll_length + jnp.arange(config.unroll_length)
         noise_keys = jax.vmap(jax.random.fold_in, (None, 0))(state.noise_key, step // config.noise_repeat)
         is_random = state.updates * float(steps_per_update) < config.prefill_steps
-        params = policy_params(state)
+        params = learner.policy_params(state.learner)
 
         def actor(obs, key):
             explore_key, uniform_key = jax.random.split(key)
-            chosen = learner.explore(params, obs, explore_key)
+            chosen = learner.explore(params, normalize(state.normalizer, obs), explore_key)
             uniform = jax.random.uniform(uniform_key, chosen.shape, minval=-1.0, maxval=1.0)
             action = jnp.where(is_random, uniform, chosen)
             return networks.to_env_action(task, action), action
@@ -183,7 +191,7 @@ def make_off_policy(
             outcome = step.outcome
             return Steps(step.obs, step.extras, outcome.reward, outcome.terminated, outcome.truncated, outcome.obs)
 
-        env_state, scores = env.renew(state.env, pool_key, params, state.updates)
+        env_state, scores = env.renew(state.env, pool_key, policy_params(state), state.updates)
         env_state, steps, stats = rollout.unroll(env, env_state, actor, noise_keys, keep)
         return state.replace(env=env_state, key=key), (steps, stats | scores)
 
@@ -203,7 +211,7 @@ def make_off_policy(
         replay = buffer.insert(state.replay, steps)
 
         def as_batch(transitions: Transition) -> Batch:
-            return Batch(transitions, normalizer, reward_scale, rate_factor)
+            return Batch(transitions, reward_scale, rate_factor)
 
         def critic_update(learner_state, inputs):
             transitions, key = inputs
@@ -217,10 +225,14 @@ def make_off_policy(
             return learner.full_update(learner_state, as_batch(transitions), key)
 
         def train(learner_state):
-            # Drawn in one go, since on a GPU small updates wait for the launch of their kernels.
+            # Drawn and normalised in one go, since on a GPU small updates wait for the launch of their kernels.
             sample_key, key = jax.random.split(update_key)
             num_transitions = updates_per_unroll * config.batch_size
             drawn = buffer.sample(replay, sample_key, num_transitions, config.n_step, config.discount)
+            drawn = drawn._replace(
+                observation=normalize(normalizer, drawn.observation),
+                next_observation=normalize(normalizer, drawn.next_observation),
+            )
             periods = (updates_per_unroll // config.policy_delay, config.policy_delay)
             drawn = jax.tree.map(lambda x: x.reshape((*periods, config.batch_size, *x.shape[1:])), drawn)
             learner_state, metrics = jax.lax.scan(policy_period, learner_state, (drawn, jax.random.split(key, periods)))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_tasks
+from brax.training.acme import running_statistics
 
 from mjx_walk import networks
 from mjx_walk.algos import ALGORITHMS
@@ -68,7 +69,8 @@ def values(name, task, config, state, obs):
         (state.normalizer, state.learner.policy), deterministic=True
     )(obs, jax.random.PRNGKey(0))
     critics = networks.make_deterministic_networks(task, config, 1 if name == "ddpg" else 2)[1]
-    return critics.apply(state.normalizer, state.learner.critic, obs, action).min(axis=-1)
+    obs = running_statistics.normalize(obs, state.normalizer)
+    return critics.apply(None, state.learner.critic, obs, action).min(axis=-1)
 
 
 @functools.cache

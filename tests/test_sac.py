@@ -60,15 +60,20 @@ def test_update_equals_brax(monkeypatch):
         theirs = begin(**kwargs)
         replaced = {
             "policy_params": learner.policy,
-            "q_params": learner.critic,
-            "target_q_params": learner.target_critic,
+            "q_params": _as_brax(learner.critic),
+            "target_q_params": _as_brax(learner.target_critic),
             "alpha_params": learner.log_alpha,
             "normalizer_params": state.normalizer,
         }
         theirs = theirs.replace(**jax.tree.map(lambda x: x[None], replaced))
         return theirs.replace(
             policy_optimizer_state=_adam(theirs.policy_optimizer_state, learner.policy_optimizer),
-            q_optimizer_state=_adam(theirs.q_optimizer_state, learner.critic_optimizer),
+            q_optimizer_state=_adam(
+                theirs.q_optimizer_state,
+                learner.critic_optimizer._replace(
+                    mu=_as_brax(learner.critic_optimizer.mu), nu=_as_brax(learner.critic_optimizer.nu)
+                ),
+            ),
             alpha_optimizer_state=_adam(theirs.alpha_optimizer_state, learner.alpha_optimizer),
         )
 
@@ -112,10 +117,20 @@ def test_update_equals_brax(monkeypatch):
     assert max(jax.tree.leaves(moved)) > 1e-3
     expected = (theirs.policy_params, theirs.q_params, theirs.target_q_params, theirs.alpha_params)
     learner = ours.learner
-    result = (learner.policy, learner.critic, learner.target_critic, learner.log_alpha)
+    result = (learner.policy, _as_brax(learner.critic), _as_brax(learner.target_critic), learner.log_alpha)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6), result, expected)
     np.testing.assert_allclose(ours.normalizer.mean, theirs.normalizer_params.mean, rtol=1e-5, atol=1e-6)
     assert metrics["alpha"] == pytest.approx(float(jnp.exp(theirs.alpha_params)), rel=1e-2)
+
+
+def _as_brax(critics):
+    """Our stacked critics as Brax's two modules; their first layer's last rows see padding."""
+    inputs = 17 + 6
+    layers = critics["params"]
+    kernel = layers["hidden_0"]["kernel"]
+    assert kernel.shape[1] == 24
+    layers = layers | {"hidden_0": layers["hidden_0"] | {"kernel": kernel[:, :inputs]}}
+    return {"params": {f"MLP_{i}": jax.tree.map(lambda x, i=i: x[i], layers) for i in range(2)}}
 
 
 def _adam(theirs, ours):

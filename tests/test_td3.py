@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from toy_tasks import ToyTask
 
-from mjx_walk import networks
 from mjx_walk.algos.ddpg import DDPGConfig
 from mjx_walk.algos.td3 import TD3Config, make_deterministic_learner
 from mjx_walk.off_policy import Batch
@@ -23,13 +22,9 @@ LINEAR = {
 
 
 def critic(*rows):
-    """One linear critic for each row: weight of the observation, weight of the action, bias."""
-    return {
-        "params": {
-            f"MLP_{i}": {"hidden_0": {"kernel": jnp.float32([[obs], [action]]), "bias": jnp.float32([bias])}}
-            for i, (obs, action, bias) in enumerate(rows)
-        }
-    }
+    """Linear critics: `(weight of the observation, weight of the action, bias)` each, padded to eight inputs."""
+    kernel = jnp.zeros((len(rows), 8, 1)).at[:, :2, 0].set(jnp.float32([row[:2] for row in rows]))
+    return {"params": {"hidden_0": {"kernel": kernel, "bias": jnp.float32([row[2:] for row in rows])}}}
 
 
 def batch():
@@ -37,7 +32,6 @@ def batch():
     obs = jnp.float32([[0.0], [0.0]])
     return Batch(
         transitions=Transition(obs, obs + 0.25, jnp.float32([3.0, 3.0]), jnp.float32([0.5, 0.0]), obs + 1.0),
-        normalizer=networks.init_normalizer(1),
         reward_scale=jnp.float32(2.0),
         rate_factor=1.0,
     )
@@ -96,7 +90,7 @@ def test_ddpg_has_one_critic_and_no_smoothing(loud_noise):
     """Target action 0, so y = 6 + 0.45 · (1 + 0) and 6."""
     assert DDPGConfig().policy_delay == 1
     learner, state = make(DDPGConfig(**LINEAR), 1, 0.0, 0.0)
-    assert len(state.critic["params"]) == 1
+    assert state.critic["params"]["hidden_0"]["bias"].shape == (1, 1)
     state = state.replace(critic=critic((0.0, 2.0, 0.0)), target_critic=critic((1.0, 2.0, 0.0)))
     _, metrics = learner.critic_update(state, batch(), jax.random.PRNGKey(0))
     assert metrics["critic_loss"] == pytest.approx(np.mean([(0.5 - 6.45) ** 2, (0.5 - 6.0) ** 2]), rel=1e-6)
@@ -105,8 +99,7 @@ def test_ddpg_has_one_critic_and_no_smoothing(loud_noise):
 def test_each_copy_explores_with_its_own_noise():
     config = TD3Config(**LINEAR, min_exploration_noise=0.0, max_exploration_noise=0.2)
     learner, state = make(config, 2, 0.2, 0.5)
-    params = (networks.init_normalizer(1), state.policy)
     obs = jnp.zeros((2, 1))
-    draws = jax.vmap(lambda key: learner.explore(params, obs, key))(jax.random.split(jax.random.PRNGKey(1), 2000))
+    draws = jax.vmap(lambda key: learner.explore(state.policy, obs, key))(jax.random.split(jax.random.PRNGKey(1), 2000))
     np.testing.assert_allclose(draws.std(axis=0)[:, 0], [0.0, 0.2], rtol=0.1)
-    assert (learner.act(params, obs, jax.random.PRNGKey(0), True) == 0).all()
+    assert (learner.act(state.policy, obs, jax.random.PRNGKey(0), True) == 0).all()

@@ -75,8 +75,7 @@ def make_sac_learner(task: Task, config: SACConfig) -> Learner:
         )
 
     def act(policy_params: Any, obs: jax.Array, key: jax.Array, deterministic: bool = False) -> jax.Array:
-        normalizer, params = policy_params
-        logits = nets.policy_network.apply(normalizer, params, obs)
+        logits = nets.policy_network.apply(None, policy_params, obs)
         distribution = nets.parametric_action_distribution
         return distribution.mode(logits) if deterministic else distribution.sample(logits, key)
 
@@ -85,7 +84,7 @@ def make_sac_learner(task: Task, config: SACConfig) -> Learner:
         loss, grads = jax.value_and_grad(critic_loss)(
             state.critic,
             state.policy,
-            batch.normalizer,
+            None,
             state.target_critic,
             jnp.exp(state.log_alpha),
             batch.transitions,
@@ -103,10 +102,9 @@ def make_sac_learner(task: Task, config: SACConfig) -> Learner:
     def full_update(state: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, Metrics]:
         alpha_key, critic_key, policy_key = jax.random.split(key, 3)
         alpha_loss, _, policy_loss = losses(reward_scaling=batch.reward_scale)
-        data = (batch.normalizer, batch.transitions)
-        alpha_grad = jax.grad(alpha_loss)(state.log_alpha, state.policy, *data, alpha_key)
+        alpha_grad = jax.grad(alpha_loss)(state.log_alpha, state.policy, None, batch.transitions, alpha_key)
         loss, grads = jax.value_and_grad(policy_loss)(
-            state.policy, batch.normalizer, state.critic, jnp.exp(state.log_alpha), batch.transitions, policy_key
+            state.policy, None, state.critic, jnp.exp(state.log_alpha), batch.transitions, policy_key
         )
         new_state, metrics = critic_update(state, batch, critic_key)
         log_alpha, alpha_optimizer = descend(

@@ -85,7 +85,7 @@ def make_deterministic_learner(
         )
 
     def choose(policy_params: Any, obs: jax.Array) -> jax.Array:
-        return jnp.tanh(policy_network.apply(*policy_params, obs))
+        return jnp.tanh(policy_network.apply(None, policy_params, obs))
 
     def explore(policy_params: Any, obs: jax.Array, key: jax.Array) -> jax.Array:
         action = choose(policy_params, obs)
@@ -96,15 +96,15 @@ def make_deterministic_learner(
 
     def critic_target(state: TD3State, batch: Batch, key: jax.Array) -> jax.Array:
         data = batch.transitions
-        action = choose((batch.normalizer, state.target_policy), data.next_observation)
+        action = choose(state.target_policy, data.next_observation)
         smoothing = target_noise * jax.random.normal(key, action.shape)
         action = jnp.clip(action + jnp.clip(smoothing, -target_noise_clip, target_noise_clip), -1.0, 1.0)
-        values = critic_network.apply(batch.normalizer, state.target_critic, data.next_observation, action)
+        values = critic_network.apply(None, state.target_critic, data.next_observation, action)
         return data.reward * batch.reward_scale + data.discount * config.discount * values.min(axis=-1)
 
     def critic_loss(critic: Any, target: jax.Array, batch: Batch) -> tuple[jax.Array, jax.Array]:
         data = batch.transitions
-        values = critic_network.apply(batch.normalizer, critic, data.observation, data.action)
+        values = critic_network.apply(None, critic, data.observation, data.action)
         return jnp.square(values - target[:, None]).mean(axis=0).sum(), values.mean()
 
     def critic_update(state: TD3State, batch: Batch, key: jax.Array) -> tuple[TD3State, Metrics]:
@@ -117,8 +117,8 @@ def make_deterministic_learner(
 
     def policy_loss(policy: Any, critic: Any, batch: Batch) -> jax.Array:
         obs = batch.transitions.observation
-        action = choose((batch.normalizer, policy), obs)
-        return -critic_network.apply(batch.normalizer, critic, obs, action)[:, 0].mean()
+        action = choose(policy, obs)
+        return -critic_network.apply(None, critic, obs, action)[:, 0].mean()
 
     def full_update(state: TD3State, batch: Batch, key: jax.Array) -> tuple[TD3State, Metrics]:
         state, metrics = critic_update(state, batch, key)
