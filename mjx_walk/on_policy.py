@@ -20,7 +20,7 @@ from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
 from mjx_walk.noise import OrnsteinUhlenbeck
 from mjx_walk.optimizers import make_adam
-from mjx_walk.schedules import adapt_rate, anneal
+from mjx_walk.schedules import adapt_rate, anneal, factor
 from mjx_walk.settings import setting
 from mjx_walk.types import Metrics, PolicyFn, Transition
 from mjx_walk.wrappers import VectorEnv, VectorState
@@ -36,8 +36,8 @@ class OnPolicyConfig:
     """Pieces of every copy in one batch."""
     learning_rate: float = setting(3e-4, above=0)
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
-    """`linear`: to zero over `schedule_steps`; `adaptive_kl`: adapted after each batch so that the policy has moved by
-    about `target_kl` at its end, and annealed as well."""
+    """`linear`: to zero over `schedule_steps`; `adaptive_kl`: the policy's is adapted after each batch so that it has
+    moved by about `target_kl` at its end, and both are annealed as well."""
     target_kl: float = setting(0.01, above=0)
     schedule_steps: int = setting(100_000_000, at_least=1)
     """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
@@ -77,7 +77,7 @@ class OnPolicyState(flax.struct.PyTreeNode):
     params: ppo_losses.PPONetworkParams
     optimizer: optax.OptState
     learning_rate: jax.Array
-    """Constant, unless the algorithm adapts it."""
+    """The policy's, which is constant unless it is adapted."""
     normalizer: RunningStatisticsState
     return_scale: returns.ReturnScale
     env: VectorState
@@ -232,6 +232,12 @@ def make_on_policy(
         return anneal(state.updates * float(steps_per_update), config.schedule_steps)
 
     return OnPolicyGround(nets, optimizer, init, collect, policy_params, policy, steps_per_update, remaining)
+
+
+def learning_rates(config: OnPolicyConfig, state: OnPolicyState, remaining: jax.Array) -> ppo_losses.PPONetworkParams:
+    """Those of policy and value network, under the schedule."""
+    share = factor(config.learning_rate_schedule, remaining)
+    return ppo_losses.PPONetworkParams(policy=state.learning_rate * share, value=config.learning_rate * share)
 
 
 def after_update(

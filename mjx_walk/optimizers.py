@@ -14,11 +14,15 @@ def make_adam(max_grad_norm: float | None = None) -> optax.GradientTransformatio
 
 
 def descend(
-    optimizer: optax.GradientTransformation, params: Any, grads: Any, state: optax.OptState, rate: jax.Array | float
+    optimizer: optax.GradientTransformation, params: Any, grads: Any, state: optax.OptState, rate: Any
 ) -> tuple[Any, optax.OptState]:
-    """One step down the gradient: `(params, optimizer state)` after it."""
+    """One step down the gradient: `(params, optimizer state)` after it.
+
+    `rate` is one for all parameters, or a tree of them whose leaves stand for subtrees of `params`.
+    """
     updates, state = optimizer.update(grads, state)
-    return optax.apply_updates(params, jax.tree.map(lambda u: -rate * u, updates)), state
+    steps = jax.tree.map(lambda rate, part: jax.tree.map(lambda u: -rate * u, part), rate, updates)
+    return optax.apply_updates(params, steps), state
 
 
 def move_towards(target: Any, params: Any, tau: float) -> Any:

@@ -17,6 +17,7 @@ from mjx_walk.on_policy import (
     OnPolicyGround,
     OnPolicyState,
     after_update,
+    learning_rates,
     require_whole_minibatches,
 )
 from mjx_walk.optimizers import descend
@@ -71,7 +72,7 @@ def learn_once(
     """
     key, shuffle_key, loss_key = jax.random.split(state.key, 3)
     remaining = ground.remaining(state)
-    rate = state.learning_rate * factor(config.learning_rate_schedule, remaining)
+    rates = learning_rates(config, state, remaining)
     entropy_cost = config.entropy_cost * factor(config.entropy_schedule, remaining)
 
     def minibatch(carry, inputs):
@@ -80,7 +81,7 @@ def learn_once(
         part = jax.tree.map(lambda x: x[rows], data)
         grads, metrics = jax.grad(loss, has_aux=True)(params, state.normalizer, part, entropy_cost, key)
         metrics |= {"grad_norm": optax.global_norm(grads)}
-        return descend(ground.optimizer, params, grads, opt_state, rate), metrics
+        return descend(ground.optimizer, params, grads, opt_state, rates), metrics
 
     rows = jax.random.permutation(shuffle_key, batch.transitions.reward.shape[0]).reshape((config.num_minibatches, -1))
     keys = jax.random.split(loss_key, config.num_minibatches)
@@ -88,7 +89,7 @@ def learn_once(
     normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
     new_state = after_update(config, state, params, optimizer, normalizer, metrics["kl"][-1], key)
     return new_state, batch.stats | jax.tree.map(jnp.mean, metrics) | {
-        "learning_rate": jnp.float32(rate),
+        "learning_rate": jnp.float32(rates.policy),
         "reward_scale": batch.reward_scale,
     }
 

@@ -16,6 +16,7 @@ from mjx_walk.on_policy import (
     OnPolicyConfig,
     OnPolicyState,
     after_update,
+    learning_rates,
     make_on_policy,
     require_whole_minibatches,
 )
@@ -54,7 +55,7 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         key, update_key = jax.random.split(state.key)
         remaining = ground.remaining(state)
-        rate = state.learning_rate * factor(config.learning_rate_schedule, remaining)
+        rates = learning_rates(config, state, remaining)
         new_normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
         # KL compares distributions under one normalizer, the one that acted.
         normalizer = state.normalizer if config.learning_rate_schedule == "adaptive_kl" else new_normalizer
@@ -76,7 +77,7 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
             data = jax.tree.map(lambda x: x[rows], batch.transitions)
             grads, metrics = jax.grad(loss_fn, has_aux=True)(params, normalizer, data, loss_key)
             metrics["grad_norm"] = optax.global_norm(grads)
-            return (*descend(ground.optimizer, params, grads, opt_state, rate), key), metrics
+            return (*descend(ground.optimizer, params, grads, opt_state, rates), key), metrics
 
         def epoch(carry, _):
             params, opt_state, key = carry
@@ -94,7 +95,7 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
         # The entropy is only told, so it may borrow the next update's key.
         return new_state, batch.stats | _loss_metrics(metrics) | {
             "entropy": nets.parametric_action_distribution.entropy(acted_with, key).mean(),
-            "learning_rate": jnp.float32(rate),
+            "learning_rate": jnp.float32(rates.policy),
             "reward_scale": batch.reward_scale,
         }
 
