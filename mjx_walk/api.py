@@ -16,6 +16,7 @@ from mjx_walk.config import Config, compile_cache_dir, load_config, read_config
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.envs.rewards import reward_file
+from mjx_walk.errors import UserError
 from mjx_walk.evaluation import Scores, score_in_gymnasium, score_in_sim
 from mjx_walk.loop import Trainer
 from mjx_walk.metrics import Row, read_rows
@@ -91,42 +92,60 @@ def resolve(overrides: list[str]) -> Config:
     Raises:
         UserError: anything wrong in it.
     """
+    return _as_saved(load_config(overrides), overrides)
+
+
+def resolve_seeds(overrides: list[str], seeds: list[int]) -> list[Config]:
+    """The same for several seeds, each in a folder `seed_N` of `run_dir`.
+
+    Raises:
+        UserError: anything wrong in it.
+    """
+    if any(override.startswith("seed=") for override in overrides):
+        raise UserError("give seed=N or seeds=[…], not both")
     config = load_config(overrides)
-    given = {override.partition("=")[0] for override in overrides}
-    if config.resume and config.run_dir and given <= {*MAY_DIFFER, "hardware"}:
-        saved = read_config(run_folder.open_existing(config.run_dir).config)
-        total_steps = config.total_steps if "total_steps" in given else saved.total_steps
-        return dataclasses.replace(saved, run_dir=config.run_dir, resume=True, total_steps=total_steps)
-    return config
+    if config.run_dir is None and config.resume:
+        raise UserError("resume=true needs run_dir=PATH of the folder that holds the seeds")
+    parent = Path(config.run_dir or run_folder.new_path(config))
+    with_seeds = (dataclasses.replace(config, seed=seed, run_dir=str(parent / f"seed_{seed}")) for seed in seeds)
+    return [_as_saved(config, overrides) for config in with_seeds]
 
 
-def train(config: Config, on_metrics: Callable[[Row], None] | None = None) -> tuple[RunFolder, str | None]:
-    """Train, then score in the real Gymnasium.
+def train(configs: list[Config], on_metrics: Callable[[Row], None] | None = None) -> tuple[list[RunFolder], str | None]:
+    """Train one run, or several that differ in their seed alone side by side; then score them in the real Gymnasium.
+
+    Args:
+        configs: checked configurations, alike but for `seed` and `run_dir`.
+        on_metrics: called with every row that is logged.
 
     Returns:
-        The run folder, and the name of the signal that stopped the run early, if one did.
+        The run folders, and the name of the signal that stopped them early, if one did.
     """
-    jax.config.update("jax_default_matmul_precision", config.matmul_precision)
+    physics = resolve_engine(configs[0].physics)
+    configs = [dataclasses.replace(config, physics=physics) for config in configs]
+    jax.config.update("jax_default_matmul_precision", configs[0].matmul_precision)
     jax.config.update("jax_compilation_cache_dir", compile_cache_dir())
-    config = dataclasses.replace(config, physics=resolve_engine(config.physics))
-    task = make_task(config)
+    task = make_task(configs[0])
     # Refuses what does not fit before a folder is made.
-    algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
-    replay = check_replay(algorithm, Path(config.run_dir or "."))
-    folder, config = run_folder.prepare(config)
-    _announce(config, folder)
+    algorithm = make_algorithm(task, configs[0].num_envs, configs[0].evaluation, configs[0].algo)
+    replay = check_replay(algorithm, Path(configs[0].run_dir or "."), len(configs))
+    folders, configs = map(list, zip(*(run_folder.prepare(config) for config in configs), strict=True))
+    _announce(configs[0], folders)
     if replay:
         print(replay, flush=True)
-    trainer = Trainer(config, task, folder, on_metrics)
+    trainer = Trainer(configs, task, folders, on_metrics)
     signal_name = trainer.train()
     if signal_name:
+        where = f"run_dir={folders[0].path}"
+        if len(folders) > 1:
+            where = f"run_dir={folders[0].path.parent} 'seeds={[config.seed for config in configs]}'"
         print(
-            f"Stopped by {signal_name} and saved. To go on: python -m mjx_walk.train run_dir={folder.path} resume=true",
+            f"Stopped by {signal_name} and saved. To go on: python -m mjx_walk.train {where} resume=true",
             flush=True,
         )
     else:
         trainer.score()
-    return folder, signal_name
+    return folders, signal_name
 
 
 def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | None = None) -> Run:
@@ -139,8 +158,18 @@ def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | 
     Raises:
         UserError: anything wrong in the overrides.
     """
-    folder, _ = train(resolve(overrides or []), on_metrics)
-    return load_run(folder.path)
+    folders, _ = train([resolve(overrides or [])], on_metrics)
+    return load_run(folders[0].path)
+
+
+def _as_saved(config: Config, overrides: list[str]) -> Config:
+    """A run's own configuration, if nothing but its folder was given to resume it."""
+    given = {override.partition("=")[0] for override in overrides}
+    if not (config.resume and config.run_dir and given <= {*MAY_DIFFER, "hardware"}):
+        return config
+    saved = read_config(run_folder.open_existing(config.run_dir).config)
+    total_steps = config.total_steps if "total_steps" in given else saved.total_steps
+    return dataclasses.replace(saved, run_dir=config.run_dir, resume=True, total_steps=total_steps)
 
 
 def _without_lost_reward(config: Config) -> Config:
@@ -151,10 +180,11 @@ def _without_lost_reward(config: Config) -> Config:
     return dataclasses.replace(config, env=dataclasses.replace(config.env, reward_function=None))
 
 
-def _announce(config: Config, folder: RunFolder) -> None:
+def _announce(config: Config, folders: list[RunFolder]) -> None:
     device = jax.devices()[0]
     where = f"{jax.device_count()} × {device.device_kind}" if device.platform != "cpu" else "the CPU"
-    print(f"Training {config.env.name} with {config.algo.name} on {where}, physics={config.physics}, in {folder.path}")
+    path = folders[0].path if len(folders) == 1 else f"{len(folders)} folders of {folders[0].path.parent}"
+    print(f"Training {config.env.name} with {config.algo.name} on {where}, physics={config.physics}, in {path}")
     if config.hardware == "cpu":
         print(
             "No accelerator: the CPU-sized recipe, with MuJoCo's C library unless another engine was asked for. "

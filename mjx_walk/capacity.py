@@ -15,12 +15,13 @@ _USABLE = 0.9
 """Share of the device's memory that a replay may take."""
 
 
-def check_replay(algorithm: Algorithm, run_dir: Path) -> str | None:
+def check_replay(algorithm: Algorithm, run_dir: Path, num_runs: int = 1) -> str | None:
     """Say what a replay takes of memory and disk.
 
     Args:
         algorithm: what is to run.
         run_dir: where it is to be saved; it need not exist.
+        num_runs: how many are to run side by side.
 
     Returns:
         One line, or None where there is no replay.
@@ -30,10 +31,11 @@ def check_replay(algorithm: Algorithm, run_dir: Path) -> str | None:
     """
     if not algorithm.replay_bytes:
         return None
-    checkpoint_bytes = num_bytes(algorithm.init, jax.random.PRNGKey(0))
-    replay, disk = f"{algorithm.replay_bytes / 1e9:,.2f} GB", f"{2 * checkpoint_bytes / 1e9:,.2f} GB"
+    replay_bytes = num_runs * algorithm.replay_bytes
+    checkpoint_bytes = num_runs * num_bytes(algorithm.init, jax.random.PRNGKey(0))
+    replay, disk = f"{replay_bytes / 1e9:,.2f} GB", f"{2 * checkpoint_bytes / 1e9:,.2f} GB"
     memory = device_memory()
-    if algorithm.replay_bytes > _USABLE * memory:
+    if replay_bytes > _USABLE * memory:
         raise UserError(
             f"the replay needs {replay}, but the device has {memory / 1e9:,.2f} GB; lower algo.replay_capacity"
         )

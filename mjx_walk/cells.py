@@ -1,4 +1,4 @@
-"""The cells of a comparison: each variant with each seed is a training run in a folder and process of its own."""
+"""The cells of a comparison: each variant with each seed is a training run in a folder of its own."""
 
 import contextlib
 import dataclasses
@@ -16,6 +16,7 @@ from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from mjx_walk import checkpoint
 from mjx_walk.config import Config, complete_overrides, load_config, read_config
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.errors import UserError
@@ -35,6 +36,7 @@ class Cell:
     variant: str
     """What sets it apart from the others, as a folder name: `ppo`, `ppo_learning_rate-0.001`."""
     overrides: tuple[str, ...]
+    """All but its seed and its folder."""
     config: Config
 
     @property
@@ -52,6 +54,12 @@ class Cell:
         return int(rows[-1]["env_steps"]) if rows else 0
 
     @property
+    def steps_saved(self) -> int | None:
+        """Environment steps behind its newest checkpoint, if it has one."""
+        saved = checkpoint.list_steps(self.folder.checkpoints)
+        return int(saved[-1].name) if saved else None
+
+    @property
     def is_finished(self) -> bool:
         """Trained to the end, and scored if it is to be."""
         if not self.folder.config.exists() or self.steps_done < self.config.total_steps:
@@ -64,7 +72,7 @@ class Cell:
 def plan(
     overrides: list[str], algos: list[str], seeds: list[int], out: str | None, hardware: str
 ) -> tuple[Path, list[Cell]]:
-    """Folder and cells of a comparison, seeds outermost, so that every variant has a first curve early.
+    """Folder and cells of a comparison.
 
     Args:
         overrides: as for `train`; a comma makes variants, `algo.learning_rate=1e-3,3e-4`.
@@ -98,9 +106,8 @@ def plan(
         parts = (text.removeprefix("algo").lstrip("=.").replace("=", "-") for text in (chosen[0], *swept))
         variant = "_".join(re.sub(r"[^\w.+-]+", "_", part) for part in parts)
         run_dir = folder / variant / f"seed_{seed}"
-        quoted = str(run_dir).replace("\\", "\\\\").replace("'", "\\'")
-        arguments = (*chosen, f"seed={seed}", f"run_dir='{quoted}'")
-        cell = Cell(variant, arguments, load_config(list(arguments)))
+        config = dataclasses.replace(load_config(list(chosen)), seed=seed, run_dir=str(run_dir))
+        cell = Cell(variant, chosen, config)
         if cells.setdefault(cell.name, cell).config != cell.config:
             raise UserError(f"two variants would share the folder {run_dir}; compare them in two comparisons")
     environments = {f"{cell.config.env.name} {cell.config.env.version}" for cell in cells.values()}
@@ -111,19 +118,36 @@ def plan(
     return folder, list(cells.values())
 
 
-def start(cell: Cell, log: Path, device: int | None, share: int, lock: int) -> subprocess.Popen:
-    """Train a cell, from where it was left, in a process of its own.
+def jobs(cells: list[Cell], together: int) -> list[list[Cell]]:
+    """What is trained in one process each: seeds of one variant that stand at the same step. First ones first, so that
+    every variant has a curve early.
 
     Args:
-        cell: not finished.
+        cells: not finished.
+        together: seeds of a process, at most.
+    """
+    alike: dict[tuple[str, int | None], list[Cell]] = {}
+    for cell in cells:
+        alike.setdefault((cell.variant, cell.steps_saved), []).append(cell)
+    parts = [[same[i : i + together] for i in range(0, len(same), together)] for same in alike.values()]
+    return [job for nth in itertools.zip_longest(*parts) for job in nth if job]
+
+
+def start(job: list[Cell], log: Path, device: int | None, share: int, lock: int) -> subprocess.Popen:
+    """Train the cells of a job, from where they were left, in a process of its own.
+
+    Args:
+        job: see `jobs`.
         log: file for what it prints.
         device: the GPU that it is to see; None leaves that as it is.
-        share: runs that share the GPU.
+        share: jobs that share the GPU.
         lock: a file descriptor to inherit.
     """
-    resume = bool(list(cell.folder.checkpoints.glob("[0-9]*")))
-    if not resume and cell.folder.config.exists():
-        shutil.rmtree(cell.folder.path)  # it was ended before it had saved anything
+    first = job[0]
+    is_resumed = first.steps_saved is not None
+    for cell in job:
+        if not is_resumed and cell.folder.config.exists():
+            shutil.rmtree(cell.folder.path)  # it was ended before it had saved anything
     env = dict(os.environ)
     if device is not None:
         visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
@@ -131,50 +155,65 @@ def start(cell: Cell, log: Path, device: int | None, share: int, lock: int) -> s
     if share > 1:
         env.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{_MEMORY_FRACTION / share:.2f}")
     log.parent.mkdir(parents=True, exist_ok=True)
-    arguments = [sys.executable, "-m", "mjx_walk.train", *cell.overrides, *(["resume=true"] if resume else [])]
+    quoted = str(first.folder.path.parent).replace("\\", "\\\\").replace("'", "\\'")
+    where = [f"run_dir='{quoted}'", f"seeds={[cell.config.seed for cell in job]}"]
+    arguments = [sys.executable, "-m", "mjx_walk.train", *first.overrides, *where]
     with log.open("a") as file:
         # A session of its own: Ctrl-C is for the parent, which passes it on once.
         pipes = {"stdout": file, "stderr": subprocess.STDOUT, "pass_fds": (lock,)}
+        arguments += ["resume=true"] if is_resumed else []
         return subprocess.Popen(arguments, env=env, start_new_session=True, **pipes)  # type: ignore[call-overload]
 
 
-def run(cells: list[Cell], devices: list[int | None], logs: Path, on_end: Callable[[Cell], None]) -> str | None:
-    """Train all cells, one at a time on each device, and say how they are getting on.
+def run(
+    waiting: list[list[Cell]], devices: list[int | None], logs: Path, on_end: Callable[[Cell, Path], None]
+) -> str | None:
+    """Work through jobs, one at a time on each device, and say how they are getting on.
 
     Args:
-        cells: not finished.
+        waiting: see `jobs`.
         devices: GPUs, each as often as it is to be shared; `[None]` for the CPU.
-        logs: folder for what the cells print.
-        on_end: called with every cell that has ended.
+        logs: folder for what the jobs print.
+        on_end: called with every cell that has ended, and the log of its job.
 
     Returns:
         The name of the signal that stopped it early, if one did; all cells have then saved.
     """
-    waiting, running, free = list(cells), dict[subprocess.Popen, tuple[Cell, int | None]](), list(devices)
+    waiting, free = list(waiting), list(devices)
+    running: dict[subprocess.Popen, tuple[list[Cell], int | None]] = {}
     share = len(devices) // len(set(devices))
     last_report = time.monotonic()
+
+    def log_of(job: list[Cell]) -> Path:
+        return logs / job[0].variant / f"seed_{'_'.join(str(cell.config.seed) for cell in job)}.txt"
+
+    def end(job: list[Cell]) -> None:
+        for cell in job:
+            on_end(cell, log_of(job))
+
     with _only_one_at_a_time(logs) as lock, Interrupt("the runs are saving") as interrupt:
         try:
             while (waiting or running) and not interrupt.signal_name:
                 while waiting and free:
-                    cell, device = waiting.pop(0), free.pop(0)
-                    running[start(cell, logs / f"{cell.name}.txt", device, share, lock)] = (cell, device)
+                    job, device = waiting.pop(0), free.pop(0)
+                    running[start(job, log_of(job), device, share, lock)] = (job, device)
                 time.sleep(0.5)
                 for process in [process for process in running if process.poll() is not None]:
-                    cell, device = running.pop(process)
+                    job, device = running.pop(process)
                     free.append(device)
-                    on_end(cell)
+                    end(job)
                 if time.monotonic() - last_report > _SECONDS_BETWEEN_REPORTS:
                     last_report = time.monotonic()
-                    for cell, _ in running.values():
-                        print(f"  {cell.name}: {_progress(cell)}", flush=True)
+                    for job, _ in running.values():
+                        for cell in job:
+                            print(f"  {cell.name}: {_progress(cell)}", flush=True)
         finally:  # however it ends, no run goes on alone
             for process in running:
                 process.send_signal(signal.SIGTERM)
             for process in running:
                 process.wait()
-        for cell, _ in running.values():
-            on_end(cell)
+        for job, _ in running.values():
+            end(job)
     return interrupt.signal_name
 
 

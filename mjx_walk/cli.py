@@ -48,6 +48,19 @@ def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Argument
     return parsed
 
 
+def read_seeds(value: Any) -> list[int]:
+    """`seeds=3` is 0, 1 and 2; `seeds=[3,7]` these.
+
+    Raises:
+        UserError: neither, or one twice.
+    """
+    seeds = list(range(value)) if type(value) is int else value
+    are_seeds = isinstance(seeds, list) and all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds)
+    if are_seeds and seeds and len(set(seeds)) == len(seeds):
+        return seeds
+    raise UserError(f"seeds={value}: give a number of seeds, or a list of different seeds from 0 up")
+
+
 def main(command: Callable[[list[str]], int | None]) -> NoReturn:
     """Run a command on the process's arguments and exit with its code."""
     try:

@@ -21,8 +21,10 @@ usage: python -m mjx_walk.compare [env=ENV] ['algos=[ppo,sac,td3]'] [seeds=3] [o
   KEY=VALUE            as for train, for all runs: env=walker2d total_steps=1_000_000
   KEY=A,B,C            a variant for each value: algo.learning_rate=1e-3,3e-4
   out=DIR              by default runs/compare_ENV; what is finished there is kept, what was interrupted goes on
-  devices=N            GPUs to use, a run on each; by default all
-  per_device=N         runs that share a GPU
+  devices=N            GPUs to use; by default all
+  per_device=N         processes that share a GPU
+  together=N           seeds of a variant that are trained in one process; by default one on a CPU, and on GPUs as many
+                       as leave none of them idle
   draw=true            only draw what is below out=DIR, from wherever it came
 
 It writes comparison.png, comparison.md and comparison.csv into out=DIR whenever a run ends.
@@ -36,6 +38,7 @@ class Arguments:
     out: str | None = None
     devices: int | None = setting(None, at_least=1)
     per_device: int = setting(1, at_least=1)
+    together: int | None = setting(None, at_least=1)
     draw: bool = False
 
 
@@ -52,7 +55,7 @@ def main(arguments: list[str]) -> int:
         return 0
     if not own.algos:
         raise UserError(f"algos=[]: choose some of: {', '.join(ALGORITHMS)}")
-    seeds = _seeds(own.seeds)
+    seeds = cli.read_seeds(own.seeds)
     hardware, available = cells.count_devices()
     count = own.devices or available
     if count > available:
@@ -61,9 +64,9 @@ def main(arguments: list[str]) -> int:
     open_cells = [cell for cell in planned if not cell.is_finished]
     print(f"{len(planned)} runs, {len(planned) - len(open_cells)} of them finished before, in {out}", flush=True)
 
-    def on_end(cell: cells.Cell) -> None:
+    def on_end(cell: cells.Cell, log: Path) -> None:
         if not cell.is_finished:
-            print(f"{cell.name}: not finished; see {out}/logs/{cell.name}.txt", flush=True)
+            print(f"{cell.name}: not finished; see {log}", flush=True)
             return
         print(f"{cell.name}: finished", flush=True)
         try:
@@ -72,7 +75,10 @@ def main(arguments: list[str]) -> int:
             print(f"warning: {out} could not be drawn: {error}", file=sys.stderr)
 
     slots: list[int | None] = list(range(count)) if hardware == "gpu" else [None]
-    signal_name = cells.run(open_cells, slots * own.per_device, out / "logs", on_end)
+    slots *= own.per_device
+    # Measured with three seeds: 1.9 to 2.4 times as fast as in turn on an H200, 1.0 to 1.1 times on two cores.
+    together = own.together or (-(-len(open_cells) // len(slots)) if hardware == "gpu" else 1)
+    signal_name = cells.run(cells.jobs(open_cells, max(together, 1)), slots, out / "logs", on_end)
     if signal_name:
         print(f"Stopped by {signal_name}; the same command goes on.")
         return exit_code(signal_name)
@@ -87,13 +93,6 @@ def _report(out: Path) -> None:
     report = write_report(out)
     print(report.read_text(), end="")
     print(f"{os.path.relpath(report)}, and .png and .csv beside it")
-
-
-def _seeds(value: Any) -> list[int]:
-    seeds = list(range(value)) if type(value) is int else value
-    if isinstance(seeds, list) and seeds and all(type(seed) is int and seed >= 0 for seed in seeds):
-        return seeds
-    raise UserError(f"seeds={value}: give a number of seeds, or a list of seeds from 0 up")
 
 
 if __name__ == "__main__":

@@ -164,10 +164,16 @@ def _markdown(groups: dict[str, list[Curve]]) -> str:
             f"{bounds[0]:,.0f} to {bounds[1]:,.0f}" if bounds else "–",
             f"{scores.min():,.0f}" if len(scores) else "–",
             f"{np.mean([run.rows[-1]['env_steps'] for run in runs]) / 1e6:,.2f}",
-            f"{np.mean([run.rows[-1]['wall_seconds'] for run in runs]):,.0f}",
+            f"{np.mean([run.rows[-1]['wall_seconds'] for run in runs]):,.0f}" + _side_by_side(runs),
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def _side_by_side(runs: list[Curve]) -> str:
+    """What is to be known of their seconds."""
+    together = max((run.scores or {}).get("seeds_together", 1) for run in runs)
+    return f" for {together} side by side" if together > 1 else ""
 
 
 def _write_csv(groups: dict[str, list[Curve]], path: Path) -> None:

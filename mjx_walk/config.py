@@ -193,11 +193,6 @@ def _recipes() -> list[Path]:
     return list((Path(CONFIG_DIR) / "recipe").glob("**/[!_]*.yaml"))
 
 
-def default_run_dir(config: Config, now: str) -> Path:
-    """Where a run goes if nothing is said."""
-    return Path("runs") / f"{config.env.name}_{config.algo.name}" / now
-
-
 def compile_cache_dir() -> str:
     """Where compiled programs are kept between runs: `JAX_COMPILATION_CACHE_DIR`, else the user's cache."""
     default = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "mjx_walk" / "jax"

@@ -1,7 +1,6 @@
 """The only host loop: run a chunk on the device, log it, evaluate, save."""
 
 import collections
-import math
 import sys
 import time
 from collections.abc import Callable
@@ -10,14 +9,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_walk import checkpoint, plots
 from mjx_walk.algos import make_algorithm
 from mjx_walk.config import Config
 from mjx_walk.envs import Task
-from mjx_walk.evaluation import Scores, score_in_gymnasium
+from mjx_walk.errors import UserError
 from mjx_walk.interrupt import Interrupt
-from mjx_walk.metrics import MetricsWriter, Progress, Row, name_metrics
-from mjx_walk.policies import deterministic_act
+from mjx_walk.metrics import Progress, Row, name_metrics
+from mjx_walk.recorder import Recorder
 from mjx_walk.run_folder import RunFolder
 from mjx_walk.types import Algorithm, Metrics, TrainState
 
@@ -69,53 +67,67 @@ def make_chunk(algorithm: Algorithm, num_updates: int, fused: bool) -> Chunk:
     return chunk
 
 
-class Trainer:
-    """One run, from its configuration to its scores."""
+def over_seeds(algorithm: Algorithm) -> Algorithm:
+    """The same for several runs side by side: keys, TrainStates, batches and metrics have an axis in front."""
+    return algorithm._replace(
+        init=jax.vmap(algorithm.init), collect=jax.vmap(algorithm.collect), learn=jax.vmap(algorithm.learn)
+    )
 
-    def __init__(self, config: Config, task: Task, folder: RunFolder, on_metrics: Callable[[Row], None] | None = None):
+
+class Trainer:
+    """From configurations to scores: of one run, or of several that differ in their seed alone, in one program."""
+
+    def __init__(
+        self,
+        configs: list[Config],
+        task: Task,
+        folders: list[RunFolder],
+        on_metrics: Callable[[Row], None] | None = None,
+    ):
         """
         Args:
-            config: checked configuration.
+            configs: checked configurations, alike but for `seed` and `run_dir`.
             task: the unbatched environment.
-            folder: prepared run folder.
+            folders: prepared run folders, one for each.
             on_metrics: called with every row that is logged.
         """
-        self.config = config
-        self.task = task
-        self.folder = folder
-        self.algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
-        self.steps_per_chunk = self.algorithm.steps_per_update * config.updates_per_chunk
+        self.config = config = configs[0]
+        self._task = task
+        alone = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
+        self.recorders = [
+            Recorder(own, task, alone, folder, len(configs)) for own, folder in zip(configs, folders, strict=True)
+        ]
+        self.algorithm = over_seeds(alone) if len(configs) > 1 else alone
+        self.steps_per_chunk = alone.steps_per_update * config.updates_per_chunk
         self.num_chunks = -(-config.total_steps // self.steps_per_chunk)
         self._chunk = make_chunk(self.algorithm, config.updates_per_chunk, fused=task.engine.name != "c")
-        self._saver = checkpoint.BackgroundSaver(folder.checkpoints, config.checkpoint.keep)
         self._on_metrics = on_metrics or (lambda row: None)
         self._started = time.monotonic()
         self._times: collections.deque[tuple[float, int]] = collections.deque()
         self._seconds_before = 0.0
-        self._best_update = -1
         self._has_warned = False
 
     def train(self) -> str | None:
         """Train to the end, or until a signal asks to stop.
 
         Returns:
-            None at the end, else the name of the signal; the state is saved either way.
+            None at the end, else the name of the signal; the states are saved either way.
         """
         state, chunk = self._start()
-        writer = MetricsWriter(self.folder.path, chunk * self.steps_per_chunk if self.config.resume else None)
         progress = Progress(self.num_chunks * self.steps_per_chunk, chunk * self.steps_per_chunk)
         saved_chunk = chunk if self.config.resume else -1
         self._times.append((time.monotonic(), chunk))
-        if chunk < self.num_chunks:
-            self.folder.gymnasium_scores.unlink(missing_ok=True)  # of a shorter run
+        for recorder in self.recorders:
+            recorder.begin(chunk * self.steps_per_chunk, trains_on=chunk < self.num_chunks)
         pending: tuple[int, Metrics] | None = None
 
         def log(chunk: int, metrics: Metrics) -> None:
-            row = self._row(chunk, metrics)
-            writer.write(row)
-            progress.update(row)
-            self._warn_of_overflow(row)
-            self._on_metrics(row)
+            rows = self._rows(chunk, metrics)
+            for recorder, row in zip(self.recorders, rows, strict=True):
+                recorder.write(row)
+                self._warn_of_overflow(row)
+                self._on_metrics(row)
+            progress.update(_mean_row(rows))
 
         with Interrupt() as interrupt:
             while chunk < self.num_chunks and not interrupt.signal_name:
@@ -132,55 +144,56 @@ class Trainer:
             if saved_chunk != chunk:
                 self._save(state, chunk)
         progress.close()
-        writer.close()
-        plots.plot_run(self.folder.path)
-        self._policies = [(self.algorithm.policy_params(state), {"env_steps": chunk * self.steps_per_chunk})]
-        best = self._best_policy(state)
-        if best:
-            self._policies.append(best)
-        if interrupt.signal_name:
-            self._saver.wait()
+        for recorder, own in zip(self.recorders, self._split(state), strict=True):
+            recorder.end(own, chunk * self.steps_per_chunk)
+            if interrupt.signal_name:
+                recorder.wait()
         return interrupt.signal_name
 
     def score(self) -> None:
-        """Score the last policy in the real Gymnasium, and write `eval_gymnasium.json`.
-
-        Where an earlier one did better in the evaluations beside training, that one is scored too, and the better
-        of the two is kept. Under a reward of one's own it is that earlier one alone.
-        """
-        num_episodes = self.config.evaluation.gymnasium_episodes
-        if num_episodes:
-            scored: list[tuple[Scores, Any, dict[str, Any]]] = []
-            # By a reward of one's own another policy may be the best than by Gymnasium's, which does not choose then.
-            candidates = self._policies[-1:] if self.task.has_own_reward else self._policies
-            for params, facts in candidates:
-                if not scored or facts["eval_return"] > scored[0][0].mean:
-                    scored.append((self._score_in_gymnasium(params, num_episodes), params, facts))
-            scores, params, facts = max(scored, key=lambda candidate: candidate[0].mean)
-            scores.save(self.folder.gymnasium_scores, env_steps=facts["env_steps"], wall_seconds=self._seconds())
-            print(f"In the real Gymnasium, {scores}", flush=True)
-            self._saver.save((self.folder.best_policy, params, facts))
-        self._saver.wait()
-
-    def _score_in_gymnasium(self, policy_params: Any, num_episodes: int) -> Scores:
-        return score_in_gymnasium(self.task, deterministic_act(self.algorithm, policy_params), num_episodes)
+        """Score every run in the real Gymnasium; see `Recorder.score`."""
+        seconds = self._seconds()  # the same for all, whichever is scored first
+        for recorder in self.recorders:
+            scores = recorder.score(seconds)
+            which = f"seed {recorder.config.seed}: " if len(self.recorders) > 1 else ""
+            if scores:
+                print(f"{which}In the real Gymnasium, {scores}", flush=True)
+            recorder.wait()
 
     def _start(self) -> tuple[TrainState, int]:
         """The TrainState to begin with, and the number of chunks behind it."""
+        keys = [jax.random.PRNGKey(recorder.config.seed) for recorder in self.recorders]
         init = make_init(self.algorithm)
-        key = jax.random.PRNGKey(self.config.seed)
+        key = keys[0] if len(keys) == 1 else jnp.stack(keys)
         if not self.config.resume:
             return init(key), 0
-        state, meta = checkpoint.restore_newest(self.folder.checkpoints, jax.eval_shape(init, key))
-        self._seconds_before = meta["wall_seconds"]
-        if self._best_policy(state):
-            self._best_update = int(state.env.live.best_update)
-        return state, meta["env_steps"] // self.steps_per_chunk
+        like = jax.eval_shape(init, key)
+        if len(keys) > 1:
+            like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), like)
+        states, facts = zip(*(recorder.restore(like) for recorder in self.recorders), strict=True)
+        steps = {fact["env_steps"] for fact in facts}
+        if len(steps) > 1:
+            at = ", ".join(f"{step:,}" for step in sorted(steps))
+            raise UserError(f"the seeds stand at different steps ({at}); resume each alone (compare: together=1)")
+        self._seconds_before = facts[0]["wall_seconds"]
+        state = states[0] if len(states) == 1 else jax.tree.map(lambda *x: jnp.stack(x), *states)
+        return state, steps.pop() // self.steps_per_chunk
 
-    def _row(self, chunk: int, metrics: Metrics) -> Row:
-        row = name_metrics(jax.device_get(metrics), self.task.reward_terms, self.algorithm.steps_per_update)
-        row["speed/steps_per_second"] = self._speed(chunk)
-        return {"env_steps": chunk * self.steps_per_chunk, "wall_seconds": self._seconds(), **row}
+    def _split(self, state: TrainState) -> Any:
+        """The TrainState of each run, one after the other."""
+        if len(self.recorders) == 1:
+            return iter([state])
+        return (jax.tree.map(lambda x, i=i: x[i], state) for i in range(len(self.recorders)))
+
+    def _rows(self, chunk: int, metrics: Metrics) -> list[Row]:
+        metrics = jax.device_get(metrics)
+        common = {"env_steps": chunk * self.steps_per_chunk, "wall_seconds": self._seconds()}
+        speed = {"speed/steps_per_second": self._speed(chunk)}
+        rows = []
+        for i in range(len(self.recorders)):
+            own = metrics if len(self.recorders) == 1 else {name: value[:, i] for name, value in metrics.items()}
+            rows.append(common | name_metrics(own, self._task.reward_terms, self.algorithm.steps_per_update) | speed)
+        return rows
 
     def _warn_of_overflow(self, row: Row) -> None:
         if row["physics/overflow"] and not self._has_warned:
@@ -193,7 +206,7 @@ class Trainer:
             )
 
     def _speed(self, chunk: int) -> float:
-        """Steps per second over the last `_SPEED_WINDOW` seconds or so, evaluation and saving included."""
+        """Steps per second of each run over the last `_SPEED_WINDOW` seconds or so, evaluation and saving included."""
         now = time.monotonic()
         while len(self._times) > 1 and now - self._times[1][0] > _SPEED_WINDOW:
             self._times.popleft()
@@ -205,23 +218,11 @@ class Trainer:
         return self._seconds_before + time.monotonic() - self._started
 
     def _save(self, state: TrainState, chunk: int) -> None:
-        """Begin to save the whole state; and the best policy, if it is a new one. Before the first evaluation is over,
-        the best policy is the present one."""
-        env_steps = chunk * self.steps_per_chunk
-        facts = {"env_steps": env_steps, "wall_seconds": self._seconds()}
-        parts = [(checkpoint.step_path(self.folder.checkpoints, env_steps), state, facts)]
-        best = self._best_policy(state)
-        if not best:
-            parts.append((self.folder.best_policy, self.algorithm.policy_params(state), {"env_steps": env_steps}))
-        elif int(state.env.live.best_update) != self._best_update:
-            self._best_update = int(state.env.live.best_update)
-            parts.append((self.folder.best_policy, *best))
-        self._saver.save(*parts)
+        for recorder, own in zip(self.recorders, self._split(state), strict=True):
+            recorder.save(own, chunk * self.steps_per_chunk, self._seconds())
 
-    def _best_policy(self, state: TrainState) -> tuple[Any, dict[str, Any]] | None:
-        """The policy that did best in the evaluations beside training, and what is known of it."""
-        live = state.env.live
-        if math.isinf(live.best_return):
-            return None
-        env_steps = int(live.best_update) * self.algorithm.steps_per_update
-        return live.best_policy_params, {"env_steps": env_steps, "eval_return": float(live.best_return)}
+
+def _mean_row(rows: list[Row]) -> Row:
+    """Means over the runs that have a value, to be shown."""
+    values = {name: [row[name] for row in rows if name in row] for name in {name for row in rows for name in row}}
+    return {name: sum(found) / len(found) for name, found in values.items()}

@@ -4,7 +4,7 @@ import dataclasses
 import datetime
 from pathlib import Path
 
-from mjx_walk.config import Config, default_run_dir, flatten, read_config, save_config
+from mjx_walk.config import Config, flatten, read_config, save_config
 from mjx_walk.errors import UserError
 
 MAY_DIFFER = ("run_dir", "resume", "total_steps")
@@ -38,6 +38,12 @@ class RunFolder:
         return self.path / "eval_gymnasium.json"
 
 
+def new_path(config: Config) -> Path:
+    """Where a run goes if nothing is said."""
+    now = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    return Path("runs") / f"{config.env.name}_{config.algo.name}" / now
+
+
 def open_existing(path: str | Path) -> RunFolder:
     """A folder that a run has written.
 
@@ -62,8 +68,7 @@ def prepare(config: Config) -> tuple[RunFolder, Config]:
     if config.run_dir is None:
         if config.resume:
             raise UserError("resume=true needs run_dir=PATH of the run to go on with")
-        now = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-        config = dataclasses.replace(config, run_dir=str(default_run_dir(config, now)))
+        config = dataclasses.replace(config, run_dir=str(new_path(config)))
     folder = RunFolder(Path(str(config.run_dir)))
     if folder.path.exists() and not folder.path.is_dir():
         raise UserError(f"run_dir={config.run_dir} is a file; choose another path")

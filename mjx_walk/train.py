@@ -1,7 +1,9 @@
 """`python -m mjx_walk.train env=humanoid algo=ppo`: train one run, or a sweep with `-m`."""
 
+import dataclasses
 import os
 import sys
+from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -9,7 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, open_dict
 
 from mjx_walk import cli
-from mjx_walk.api import resolve, train
+from mjx_walk.api import resolve, resolve_seeds, train
 from mjx_walk.config import CONFIG_DIR, complete_overrides, load_config, register_schemas, to_config
 from mjx_walk.interrupt import exit_code
 
@@ -17,12 +19,18 @@ USAGE = """
 usage: python -m mjx_walk.train [env=humanoid|humanoid_standup|walker2d] [algo=ppo] [KEY=VALUE ...]
 
   physics=auto|warp|jax|c   num_envs=N   total_steps=N   seed=N   run_dir=PATH   resume=true
+  seeds=N or [3,7]                        several seeds side by side in one program, each in a folder of its own
   recipe=PATH_BELOW_configs/recipe        another recipe than the one for the environment and the hardware
   env.KEY=VALUE                           Gymnasium's keywords, and version=v4 as env.version=v4
   algo.KEY=VALUE                          the algorithm's settings
   -m seed=0,1,2                           a sweep, by Hydra; its launchers work
   --cfg job                               print the configuration and stop
 """
+
+
+@dataclasses.dataclass
+class Seeds:
+    seeds: Any = 1
 
 
 def main(arguments: list[str]) -> int:
@@ -33,7 +41,13 @@ def main(arguments: list[str]) -> int:
     if any(argument.startswith("-") for argument in arguments):
         _through_hydra(arguments)
         return 0
-    _, signal_name = train(resolve(arguments))
+    own = [argument for argument in arguments if argument.startswith("seeds=")]
+    if own:
+        seeds = cli.read_seeds(cli.parse(Seeds, own, USAGE).seeds)
+        configs = resolve_seeds([argument for argument in arguments if argument not in own], seeds)
+    else:
+        configs = [resolve(arguments)]
+    _, signal_name = train(configs)
     return exit_code(signal_name) if signal_name else 0
 
 
@@ -54,7 +68,7 @@ def _sweep_job(node: DictConfig) -> None:
     if node.run_dir is None:
         with open_dict(node):
             node.run_dir = HydraConfig.get().runtime.output_dir
-    train(to_config(node))
+    train([to_config(node)])
 
 
 if __name__ == "__main__":

@@ -162,7 +162,7 @@ def test_an_interrupted_comparison_goes_on(tmp_path):
 BAD = [
     (["algos=[dqn]"], "algos=['dqn']: choose one of: ppo"),
     (["algos=[]"], "algos=[]: choose some of: ppo"),
-    (["seeds=0"], "seeds=0: give a number of seeds, or a list of seeds from 0 up"),
+    (["seeds=0"], "seeds=0: give a number of seeds, or a list of different seeds from 0 up"),
     (["seeds=[a]"], "give a number of seeds"),
     (["algo=ppo"], "'algo=ppo': in a comparison write algos=[…]"),
     (["seed=1"], "write seeds=N"),
@@ -202,6 +202,19 @@ def test_a_folder_with_other_settings_is_left_alone(tmp_path, monkeypatch):
             compare_command.main(["env=walker2d", "algos=[ppo]", "out=out", change])
 
 
+def test_seeds_that_stand_at_the_same_step_are_trained_together(tmp_path):
+    """Of three seeds one has a checkpoint; first ones of all variants come first."""
+    _, planned = cells.plan(["env=walker2d"], ["ppo", "a2c"], [0, 1, 2], str(tmp_path), "cpu")
+    (tmp_path / "ppo" / "seed_1" / "checkpoints" / "4096").mkdir(parents=True)
+
+    def names(together):
+        return [[cell.name for cell in job] for job in cells.jobs(planned, together)]
+
+    assert names(3) == [["ppo/seed_0", "ppo/seed_2"], ["a2c/seed_0", "a2c/seed_1", "a2c/seed_2"], ["ppo/seed_1"]]
+    assert names(2)[1:] == [["a2c/seed_0", "a2c/seed_1"], ["ppo/seed_1"], ["a2c/seed_2"]]
+    assert names(1)[:3] == [["ppo/seed_0"], ["a2c/seed_0"], ["ppo/seed_1"]]
+
+
 class FakeProcess:
     """A run that goes on until it is told to stop."""
 
@@ -222,16 +235,16 @@ def test_no_run_goes_on_alone(tmp_path, monkeypatch):
     """One of two runs ends, and what is to be done then fails."""
     _, planned = cells.plan(["env=walker2d"], ["ppo"], [0, 1], str(tmp_path), "cpu")
     processes = [FakeProcess(code=0), FakeProcess()]
-    monkeypatch.setattr(cells, "start", lambda cell, *_: processes[cell.config.seed])
+    monkeypatch.setattr(cells, "start", lambda job, *_: processes[job[0].config.seed])
     with pytest.raises(ZeroDivisionError):
-        cells.run(planned, [0, 1], tmp_path / "logs", lambda cell: 1 // 0)
+        cells.run(cells.jobs(planned, 1), [0, 1], tmp_path / "logs", lambda cell, log: 1 // 0)
     assert processes[1].signals == [signal.SIGTERM]
 
 
 def test_a_second_comparison_in_the_same_folder_waits_its_turn(tmp_path):
     with cells._only_one_at_a_time(tmp_path / "out" / "logs"), pytest.raises(UserError, match="still going on"):
-        cells.run([], [None], tmp_path / "out" / "logs", lambda cell: None)
-    assert cells.run([], [None], tmp_path / "out" / "logs", lambda cell: None) is None
+        cells.run([], [None], tmp_path / "out" / "logs", lambda cell, log: None)
+    assert cells.run([], [None], tmp_path / "out" / "logs", lambda cell, log: None) is None
 
 
 def test_a_run_that_fails_is_named(tmp_path):
@@ -258,8 +271,8 @@ def test_each_run_sees_its_own_gpu(tmp_path, monkeypatch, visible, expected):
     started = []
     monkeypatch.setattr(subprocess, "Popen", lambda arguments, **kwargs: started.append((arguments, kwargs["env"])))
     _, (cell,) = cells.plan(["env=walker2d"], ["ppo"], [3], str(tmp_path), "gpu")
-    cells.start(cell, tmp_path / "logs" / "cell.txt", 1, 2, 0)
+    cells.start([cell], tmp_path / "logs" / "cell.txt", 1, 2, 0)
     ((arguments, environment),) = started
     assert environment["CUDA_VISIBLE_DEVICES"] == expected
     assert float(environment["XLA_PYTHON_CLIENT_MEM_FRACTION"]) <= 0.75 / 2 + 0.01
-    assert "seed=3" in arguments and "resume=true" not in arguments
+    assert "seeds=[3]" in arguments and "resume=true" not in arguments
