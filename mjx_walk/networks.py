@@ -1,5 +1,6 @@
 """What wraps Brax's networks: the observation normalizer, and actions in Gymnasium's units."""
 
+import dataclasses
 import functools
 import math
 from typing import Any
@@ -27,7 +28,7 @@ def make_ppo_networks(task: Task, config: Any) -> ppo_networks.PPONetworks:
         task: gives the sizes.
         config: with `policy_hidden_layer_sizes`, `value_hidden_layer_sizes`, `activation`, `distribution`
             (`tanh_normal`: state-dependent std, squashed; `normal`: unbounded, std dependent or not),
-            `init_noise_std`, `state_dependent_std`, `min_log_std`, `max_log_std` and `observation_clip`.
+            `init_noise_std`, `state_dependent_std`, `min_log_std`, `max_log_std`, `observation_clip`, `network_dtype`.
 
     Raises:
         UserError: the bounds of the std exclude each other.
@@ -43,14 +44,18 @@ def make_ppo_networks(task: Task, config: Any) -> ppo_networks.PPONetworks:
     nets = ppo_networks.make_ppo_networks(
         task.observation_size,
         task.action_size,
-        preprocess_observations_fn=functools.partial(
-            running_statistics.normalize, max_abs_value=config.observation_clip
-        ),
+        preprocess_observations_fn=lambda obs, normalizer: running_statistics.normalize(
+            obs, normalizer, max_abs_value=config.observation_clip
+        ).astype(config.network_dtype),
         policy_hidden_layer_sizes=tuple(config.policy_hidden_layer_sizes),
         value_hidden_layer_sizes=tuple(config.value_hidden_layer_sizes),
         activation=ACTIVATION[config.activation],
         distribution_type=config.distribution,
         **normal_only,
+    )
+    nets = nets.replace(
+        policy_network=_compute_in(config.network_dtype, nets.policy_network),
+        value_network=_compute_in(config.network_dtype, nets.value_network),
     )
     if config.distribution == "normal":
         if config.min_log_std > config.max_log_std:
@@ -76,7 +81,8 @@ def make_sac_networks(task: Task, config: Any) -> sac_networks.SACNetworks:
 
     Args:
         task: gives the sizes.
-        config: with `policy_hidden_layer_sizes`, `policy_layer_norm`, the same two for `critic`, and `activation`.
+        config: with `policy_hidden_layer_sizes`, `policy_layer_norm`, the same two for `critic`, `activation` and
+            `network_dtype`.
     """
     distribution = NormalTanhDistribution(event_size=task.action_size)
     return sac_networks.SACNetworks(
@@ -94,13 +100,15 @@ def make_deterministic_networks(
 
 
 def _policy_network(num_outputs: int, task: Task, config: Any) -> brax_networks.FeedForwardNetwork:
-    return brax_networks.make_policy_network(
+    network = brax_networks.make_policy_network(
         num_outputs,
         task.observation_size,
+        preprocess_observations_fn=lambda obs, _: obs.astype(config.network_dtype),
         hidden_layer_sizes=tuple(config.policy_hidden_layer_sizes),
         activation=ACTIVATION[config.activation],
         layer_norm=config.policy_layer_norm,
     )
+    return _compute_in(config.network_dtype, network)
 
 
 def _critic_network(num_critics: int, task: Task, config: Any) -> brax_networks.FeedForwardNetwork:
@@ -125,9 +133,21 @@ def _critic_network(num_critics: int, task: Task, config: Any) -> brax_networks.
     def apply(_: Any, params: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
         """`[…, num_critics]`."""
         inputs = jnp.concatenate([obs, action, jnp.zeros((*obs.shape[:-1], padding), obs.dtype)], axis=-1)
-        return jax.vmap(critic.apply, (0, None), -1)(params, inputs)[..., 0, :]
+        return jax.vmap(critic.apply, (0, None), -1)(params, inputs.astype(config.network_dtype))[..., 0, :]
 
-    return brax_networks.FeedForwardNetwork(init=init, apply=apply)
+    return _compute_in(config.network_dtype, brax_networks.FeedForwardNetwork(init=init, apply=apply))
+
+
+def _compute_in(dtype: str, network: brax_networks.FeedForwardNetwork) -> brax_networks.FeedForwardNetwork:
+    """A network that computes in `dtype`, to which it casts its inputs itself; parameters and results are float32."""
+
+    def cast(tree: Any, dtype: Any) -> Any:
+        return jax.tree.map(lambda x: x.astype(dtype), tree)
+
+    def apply(normalizer: Any, params: Any, *inputs: jax.Array) -> Any:
+        return cast(network.apply(normalizer, cast(params, dtype), *inputs), jnp.float32)
+
+    return dataclasses.replace(network, apply=apply)
 
 
 def init_normalizer(observation_size: int) -> running_statistics.RunningStatisticsState:

@@ -63,6 +63,8 @@ class OffPolicyConfig:
     policy_layer_norm: bool = False
     critic_layer_norm: bool = False
     activation: str = setting("relu", choices=tuple(ACTIVATION))
+    network_dtype: str = setting("float32", choices=("float32", "bfloat16"))
+    """That the networks compute in. Parameters, losses and optimizers are float32."""
     stagger_episodes: bool = True
 
 

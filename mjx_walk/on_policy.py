@@ -60,6 +60,8 @@ class OnPolicyConfig:
     policy_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 128), at_least=1)
     value_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 256, 256), at_least=1)
     activation: str = setting("swish", choices=tuple(ACTIVATION))
+    network_dtype: str = setting("float32", choices=("float32", "bfloat16"))
+    """That the networks compute in. Parameters, losses and optimizers are float32."""
     distribution: str = setting("tanh_normal", choices=("tanh_normal", "normal"))
     """Squashed, with a std that depends on the state, or unbounded; the next four are for the latter."""
     init_noise_std: float = setting(1.0, above=0)

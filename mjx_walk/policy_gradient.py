@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,6 @@ from mjx_walk.on_policy import (
     OnPolicyState,
     after_update,
     learning_rates,
-    require_whole_minibatches,
 )
 from mjx_walk.optimizers import descend
 from mjx_walk.schedules import factor
@@ -34,19 +33,39 @@ class PolicyGradientConfig(OnPolicyConfig):
     """Squashed, it runs away: nothing holds the mean back where tanh is flat."""
     num_unrolls: int = setting(1, at_least=1)
     num_minibatches: int = setting(1, at_least=1)
-    """Gradient steps on a batch, each on pieces of its own."""
+    """Gradient steps on a batch, each on steps of its own, drawn from all pieces."""
 
 
-def check_minibatches(num_envs: int, config: PolicyGradientConfig) -> None:
-    """Check that a batch can be learned from as the settings say.
+def check_minibatches(num_steps: int, config: PolicyGradientConfig) -> None:
+    """Check that a batch of `num_steps` steps can be learned from as the settings say.
 
     Raises:
-        UserError: its pieces do not divide into the minibatches; or the rate is to adapt to the KL, of which a single
-            gradient step knows nothing.
+        UserError: there are fewer than minibatches; or the rate is to adapt to the KL, of which a single gradient step
+            knows nothing.
     """
-    require_whole_minibatches(num_envs, config.num_unrolls, config.num_minibatches)
+    if num_steps < config.num_minibatches:
+        raise UserError(f"algo.num_minibatches={config.num_minibatches} is more than the {num_steps} steps of a batch")
     if config.learning_rate_schedule == "adaptive_kl" and config.num_minibatches == 1:
         raise UserError("algo.learning_rate_schedule=adaptive_kl needs algo.num_minibatches of 2 or more")
+
+
+class Steps(NamedTuple):
+    """What is learned from, step by step, `[S, …]`."""
+
+    observation: jax.Array
+    raw_action: jax.Array
+    acted_log_prob: jax.Array
+    """Of the policy that acted."""
+    advantage: jax.Array
+    weight: jax.Array
+    """0 for steps that do not count."""
+    target: jax.Array | tuple[()]
+    """For the value network; empty where there is none."""
+
+
+def flatten(steps: Steps) -> Steps:
+    """`[T, N, …]` or `[N, T, …]` to `[S, …]`."""
+    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), steps)
 
 
 def learn_once(
@@ -54,18 +73,18 @@ def learn_once(
     config: PolicyGradientConfig,
     state: OnPolicyState,
     batch: OnPolicyBatch,
-    data: Any,
-    loss: Callable[[Any, RunningStatisticsState, Any, jax.Array, jax.Array], tuple[jax.Array, Metrics]],
+    steps: Steps,
+    value_loss: Callable[[Any, RunningStatisticsState, Steps], tuple[jax.Array, Metrics]],
 ) -> tuple[OnPolicyState, Metrics]:
-    """One pass over a batch in minibatches, each piece used for one gradient step, under the normalizer that acted.
+    """One pass over a batch in minibatches, each step used for one gradient step, under the normalizer that acted.
 
     Args:
         ground: of the algorithm.
         config: settings.
         state: before.
         batch: as collected.
-        data: what the loss reads of it; a tree of `[N, …]`.
-        loss: `(params, normalizer, data of a minibatch, entropy cost, key)` to `(loss, metrics)`, among them `kl`.
+        steps: of the batch, each used for one gradient step; up to `num_minibatches - 1` are left over.
+        value_loss: `(params, normalizer, minibatch) → (loss to be added, metrics)`.
 
     Returns:
         The state after it, and all metrics.
@@ -75,15 +94,28 @@ def learn_once(
     rates = learning_rates(config, state, remaining)
     entropy_cost = config.entropy_cost * factor(config.entropy_schedule, remaining)
 
+    distribution = ground.nets.parametric_action_distribution
+
+    def loss(params, part: Steps, key):
+        logits = ground.nets.policy_network.apply(state.normalizer, params.policy, part.observation)
+        log_prob = distribution.log_prob(logits, part.raw_action)
+        entropy = distribution.entropy(logits, key).mean()
+        losses = policy_gradient_loss(log_prob, part.acted_log_prob, part.advantage)
+        policy_loss = (part.weight * losses).sum() / jnp.maximum(part.weight.sum(), 1.0)
+        further_loss, metrics = value_loss(params, state.normalizer, part)
+        metrics |= {"policy_loss": policy_loss, "entropy": entropy, "kl": sampled_kl(log_prob, part.acted_log_prob)}
+        return policy_loss + further_loss - entropy_cost * entropy, metrics
+
     def minibatch(carry, inputs):
         params, opt_state = carry
         rows, key = inputs
-        part = jax.tree.map(lambda x: x[rows], data)
-        grads, metrics = jax.grad(loss, has_aux=True)(params, state.normalizer, part, entropy_cost, key)
-        metrics |= {"grad_norm": optax.global_norm(grads)}
+        part = jax.tree.map(lambda x: x[rows], steps)
+        (total, metrics), grads = jax.value_and_grad(loss, has_aux=True)(params, part, key)
+        metrics |= {"loss": total, "grad_norm": optax.global_norm(grads)}
         return descend(ground.optimizer, params, grads, opt_state, rates), metrics
 
-    rows = jax.random.permutation(shuffle_key, batch.transitions.reward.shape[0]).reshape((config.num_minibatches, -1))
+    num_steps = steps.weight.size // config.num_minibatches * config.num_minibatches
+    rows = jax.random.permutation(shuffle_key, steps.weight.size)[:num_steps].reshape((config.num_minibatches, -1))
     keys = jax.random.split(loss_key, config.num_minibatches)
     (params, optimizer), metrics = jax.lax.scan(minibatch, (state.params, state.optimizer), (rows, keys))
     normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
@@ -94,16 +126,25 @@ def learn_once(
     }
 
 
+_MAX_IMPORTANCE = 10.0
+
+
 def policy_gradient_loss(log_prob: jax.Array, acted_log_prob: jax.Array, advantages: jax.Array) -> jax.Array:
-    """Minus the advantages times the log-probability, `[…]`, weighted by how much less likely the action has become.
+    """Minus the advantages times the log-probability, `[…]`, weighted by how much likelier the action has become.
 
     At a batch's first gradient step the weight is 1. Without it, an action to be avoided is pushed away the harder the
-    less likely it already is, and a few steps on one batch leave its policy far behind.
-
-    Source: Espeholt et al. 2018 (IMPALA), truncated importance weights with a bound of 1.
+    less likely it already is, and a few steps on one batch leave its policy far behind. A bound of 1, as in IMPALA,
+    would leave a pull wherever advantages share a sign; this one only guards against what a float cannot hold.
     """
-    weight = jax.lax.stop_gradient(jnp.exp(jnp.minimum(log_prob - acted_log_prob, 0.0)))
+    weight = jax.lax.stop_gradient(jnp.minimum(jnp.exp(log_prob - acted_log_prob), _MAX_IMPORTANCE))
     return -weight * advantages * log_prob
+
+
+def normalize(values: jax.Array, weight: jax.Array) -> jax.Array:
+    """To mean 0 and std 1 over what counts."""
+    total = jnp.maximum(weight.sum(), 1.0)
+    centred = values - (weight * values).sum() / total
+    return centred / jnp.sqrt((weight * centred**2).sum() / total + 1e-8)
 
 
 def sampled_kl(log_prob: jax.Array, acted_log_prob: jax.Array) -> jax.Array:

@@ -106,4 +106,5 @@ def test_policy_gradient_is_plain_at_first_and_lets_go_of_what_has_become_unlike
     gradient = jax.grad(lambda log_prob: policy_gradient_loss(log_prob, acted, advantages).sum())
     np.testing.assert_allclose(gradient(acted), -advantages)
     np.testing.assert_allclose(gradient(acted - 30.0), 0.0, atol=1e-12)
-    np.testing.assert_allclose(gradient(acted + 5.0), -advantages)
+    np.testing.assert_allclose(gradient(acted + 1.0), -jnp.e * advantages, rtol=1e-6)
+    np.testing.assert_allclose(gradient(acted + 1e6), -10.0 * advantages)

@@ -10,13 +10,7 @@ from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
-from mjx_walk.policy_gradient import (
-    PolicyGradientConfig,
-    check_minibatches,
-    learn_once,
-    policy_gradient_loss,
-    sampled_kl,
-)
+from mjx_walk.policy_gradient import PolicyGradientConfig, Steps, check_minibatches, flatten, learn_once, normalize
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -57,43 +51,26 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
             f"{unseen_after_piece[0]:.2f}, above algo.max_unseen={config.max_unseen}; "
             "lengthen it, or lower algo.discount"
         )
-    check_minibatches(num_envs, config)
+    check_minibatches(num_envs * config.num_unrolls * num_learned, config)
     ground = make_on_policy(task, num_envs, evaluation, config, has_value=False)
-    distribution = ground.nets.parametric_action_distribution
 
-    def loss(params, normalizer, data, entropy_cost, key):
-        """`data`: transitions, normalised returns and weights, `[N, T, …]`."""
-        transitions, advantage, weight = data
-        logits = ground.nets.policy_network.apply(normalizer, params.policy, transitions.observation)
-        log_prob = distribution.log_prob(logits, transitions.extras["policy_extras"]["raw_action"])
-        entropy = distribution.entropy(logits, key).mean()
-        acted_log_prob = transitions.extras["policy_extras"]["log_prob"]
-        losses = policy_gradient_loss(log_prob, acted_log_prob, advantage)
-        policy_loss = (weight * losses).sum() / jnp.maximum(weight.sum(), 1.0)
-        kl = sampled_kl(log_prob, acted_log_prob)
-        return policy_loss - entropy_cost * entropy, {"policy_loss": policy_loss, "entropy": entropy, "kl": kl}
+    def no_value_loss(*_) -> tuple[jax.Array, Metrics]:
+        return jnp.float32(0.0), {}
 
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
-        transitions = batch.transitions._replace(next_observation=())
+        data = batch.transitions
         return_to_go, unseen = returns.returns_to_go(
-            transitions.reward.T,
-            transitions.discount.T == 0.0,
-            transitions.extras["state_extras"]["truncation"].T > 0.0,
+            data.reward.T,
+            data.discount.T == 0.0,
+            data.extras["state_extras"]["truncation"].T > 0.0,
             config.discount,
         )
         # Of these steps, only those before a time limit can have too much unseen.
-        weight = jnp.float32(config.max_unseen >= unseen.T)
-        kept = jax.tree.map(lambda x: x[:, :num_learned], (transitions, return_to_go.T * batch.reward_scale, weight))
-        transitions, return_to_go, weight = kept
-        data = (transitions, _normalize(return_to_go, weight), weight)
-        new_state, metrics = learn_once(ground, config, state, batch, data, loss)
+        weight = jnp.float32(config.max_unseen >= unseen.T[:, :num_learned])
+        advantage = normalize(return_to_go.T[:, :num_learned], weight)
+        acted = jax.tree.map(lambda x: x[:, :num_learned], data.extras["policy_extras"])
+        steps = Steps(data.observation[:, :num_learned], acted["raw_action"], acted["log_prob"], advantage, weight, ())
+        new_state, metrics = learn_once(ground, config, state, batch, flatten(steps), no_value_loss)
         return new_state, metrics | {"learned_from": weight.mean() * num_learned / config.unroll_length}
 
     return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)
-
-
-def _normalize(values: jax.Array, weight: jax.Array) -> jax.Array:
-    """To mean 0 and std 1 over what counts."""
-    total = jnp.maximum(weight.sum(), 1.0)
-    centred = values - (weight * values).sum() / total
-    return centred / jnp.sqrt((weight * centred**2).sum() / total + 1e-8)

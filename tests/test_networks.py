@@ -1,0 +1,55 @@
+"""Networks: what they compute in, and what they hand on."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_walk import networks
+from mjx_walk.algos.a2c import A2CConfig
+from mjx_walk.algos.ppo import PPOConfig
+from mjx_walk.algos.sac import SACConfig
+from mjx_walk.envs import make_env
+
+KEY = jax.random.PRNGKey(0)
+
+
+def actor_and_critic(config):
+    """Functions of parameters, observation and action; and parameters."""
+    task = make_env("walker2d", physics="c")
+    normalizer = networks.init_normalizer(task.observation_size)
+    if isinstance(config, SACConfig):
+        nets = networks.make_sac_networks(task, config)
+        policy, critic = nets.policy_network, nets.q_network
+        value = lambda params, obs, action: critic.apply(None, params, obs, action)  # noqa: E731
+    else:
+        nets = networks.make_ppo_networks(task, config)
+        policy, critic = nets.policy_network, nets.value_network
+        value = lambda params, obs, action: critic.apply(normalizer, params, obs)  # noqa: E731
+    return lambda params, obs: policy.apply(normalizer, params, obs), value, policy.init(KEY), critic.init(KEY)
+
+
+@pytest.mark.parametrize("make_config", [PPOConfig, A2CConfig, SACConfig])
+def test_networks_compute_in_bfloat16(make_config):
+    """About as in float32, but not the same; parameters, results and gradients stay float32."""
+    obs, action = jax.random.normal(KEY, (64, 17)), jnp.tanh(jax.random.normal(KEY, (64, 6)))
+    results = []
+    for dtype in ("float32", "bfloat16"):
+        act, value, policy_params, critic_params = actor_and_critic(make_config(network_dtype=dtype))
+        grads = jax.grad(lambda params, value=value: value(params, obs, action).sum())(critic_params)
+        results.append(jax.tree.leaves((act(policy_params, obs), value(critic_params, obs, action), grads)))
+    for exact, rough in zip(*results, strict=True):
+        assert exact.dtype == rough.dtype == jnp.float32
+        assert np.linalg.norm(rough - exact) < 0.1 * np.linalg.norm(exact)
+    assert not np.array_equal(results[0][-1], results[1][-1])
+
+
+def test_critics_are_brax_networks_of_their_own():
+    """Padding changes nothing: zeros in, no gradient; and the two differ."""
+    _, value, _, params = actor_and_critic(SACConfig())
+    obs, action = jax.random.normal(KEY, (64, 17)), jnp.zeros((64, 6))
+    kernel = params["params"]["hidden_0"]["kernel"]
+    grad = jax.grad(lambda params: value(params, obs, action).sum())(params)["params"]["hidden_0"]["kernel"]
+    assert kernel.shape == (2, 24, 256) and (kernel[:, 23] == 0).all() and (grad[:, 23] == 0).all()
+    values = np.asarray(value(params, obs, action))
+    assert values.shape == (64, 2) and not np.allclose(values[:, 0], values[:, 1])
