@@ -66,7 +66,9 @@ def main(arguments: list[str]) -> int:
 
     def on_end(cell: cells.Cell, log: Path) -> None:
         if not cell.is_finished:
-            print(f"{cell.name}: not finished; see {log}", flush=True)
+            is_full = "RESOURCE_EXHAUSTED" in log.read_text(errors="replace")
+            hint = "; memory ran out, so try together=1 or a smaller num_envs" if is_full else ""
+            print(f"{cell.name}: not finished; see {log}{hint}", flush=True)
             return
         print(f"{cell.name}: finished", flush=True)
         try:
