@@ -129,7 +129,7 @@ def train(configs: list[Config], on_metrics: Callable[[Row], None] | None = None
     # Refuses what does not fit before a folder is made.
     algorithm = make_algorithm(task, configs[0].num_envs, configs[0].evaluation, configs[0].algo)
     replay = check_replay(algorithm, Path(configs[0].run_dir or "."), len(configs))
-    folders, configs = map(list, zip(*(run_folder.prepare(config) for config in configs), strict=True))
+    folders, configs = run_folder.prepare(configs)
     _announce(configs[0], folders)
     if replay:
         print(replay, flush=True)

@@ -36,8 +36,9 @@ def check_replay(algorithm: Algorithm, run_dir: Path, num_runs: int = 1) -> str 
     replay, disk = f"{replay_bytes / 1e9:,.2f} GB", f"{2 * checkpoint_bytes / 1e9:,.2f} GB"
     memory = device_memory()
     if replay_bytes > _USABLE * memory:
+        fewer = " or train fewer seeds side by side (compare: together=1)" if num_runs > 1 else ""
         raise UserError(
-            f"the replay needs {replay}, but the device has {memory / 1e9:,.2f} GB; lower algo.replay_capacity"
+            f"the replay needs {replay}, but the device has {memory / 1e9:,.2f} GB; lower algo.replay_capacity{fewer}"
         )
     existing = next(path for path in (run_dir.absolute(), *run_dir.absolute().parents) if path.exists())
     free = shutil.disk_usage(existing).free

@@ -133,6 +133,14 @@ def jobs(cells: list[Cell], together: int) -> list[list[Cell]]:
     return [job for nth in itertools.zip_longest(*parts) for job in nth if job]
 
 
+def most_together(cells: list[Cell], num_slots: int) -> int:
+    """How many seeds a process may have for as many processes as there are places, if there are so many cells."""
+    for together in range(max(map(len, jobs(cells, len(cells))), default=1), 1, -1):
+        if len(jobs(cells, together)) >= min(num_slots, len(cells)):
+            return together
+    return 1
+
+
 def start(job: list[Cell], log: Path, device: int | None, share: int, lock: int) -> subprocess.Popen:
     """Train the cells of a job, from where they were left, in a process of its own.
 
@@ -185,7 +193,8 @@ def run(
     last_report = time.monotonic()
 
     def log_of(job: list[Cell]) -> Path:
-        return logs / job[0].variant / f"seed_{'_'.join(str(cell.config.seed) for cell in job)}.txt"
+        first, last = job[0].config.seed, job[-1].config.seed
+        return logs / job[0].variant / (f"seed_{first}.txt" if len(job) == 1 else f"seeds_{first}_to_{last}.txt")
 
     def end(job: list[Cell]) -> None:
         for cell in job:

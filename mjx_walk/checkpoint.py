@@ -96,7 +96,10 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
     for name, leaf in wanted.items():
         if name not in arrays or arrays[name].shape != leaf.shape or arrays[name].dtype != leaf.dtype:
             found = f"{arrays[name].shape} {arrays[name].dtype}" if name in arrays else "nothing"
-            raise UserError(f"{path} is of another run: {name} should be {leaf.shape} {leaf.dtype}, found {found}")
+            raise UserError(
+                f"{path} is of another run, or of another version: "
+                f"{name} should be {leaf.shape} {leaf.dtype}, found {found}"
+            )
     leaves = [jnp.asarray(arrays[name]) for name in wanted]
     return jax.tree.unflatten(jax.tree.structure(like), leaves), meta
 

@@ -171,19 +171,20 @@ def _markdown(groups: dict[str, list[Curve]]) -> str:
 
 
 def _side_by_side(runs: list[Curve]) -> str:
-    """What is to be known of their seconds."""
-    together = max((run.scores or {}).get("seeds_together", 1) for run in runs)
-    return f" for {together} side by side" if together > 1 else ""
+    """With how many seeds their seconds were shared."""
+    together = sorted({int(run.rows[-1].get("speed/seeds_together", 1)) for run in runs})
+    return "" if together == [1] else f", {' or '.join(map(str, together))} seeds side by side"
 
 
 def _write_csv(groups: dict[str, list[Curve]], path: Path) -> None:
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["variant", "seed", "gymnasium_mean", "gymnasium_std", "env_steps", "wall_seconds", "run_dir"])
+        figures = ("gymnasium_mean", "gymnasium_std", "env_steps", "wall_seconds", "seeds_together")
+        writer.writerow(["variant", "seed", *figures, "run_dir"])
         for name, runs in groups.items():
             for run in runs:
                 scores, last = run.scores or {}, run.rows[-1]
                 writer.writerow(
                     [name, run.config.seed, scores.get("mean"), scores.get("std"), last["env_steps"],
-                     last["wall_seconds"], run.config.run_dir]
+                     last["wall_seconds"], last.get("speed/seeds_together", 1), run.config.run_dir]
                 )  # fmt: skip

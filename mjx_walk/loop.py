@@ -4,10 +4,10 @@ import collections
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjx_walk.algos import make_algorithm
 from mjx_walk.config import Config
@@ -94,9 +94,7 @@ class Trainer:
         self.config = config = configs[0]
         self._task = task
         alone = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
-        self.recorders = [
-            Recorder(own, task, alone, folder, len(configs)) for own, folder in zip(configs, folders, strict=True)
-        ]
+        self.recorders = [Recorder(own, task, alone, folder) for own, folder in zip(configs, folders, strict=True)]
         self.algorithm = over_seeds(alone) if len(configs) > 1 else alone
         self.steps_per_chunk = alone.steps_per_update * config.updates_per_chunk
         self.num_chunks = -(-config.total_steps // self.steps_per_chunk)
@@ -144,6 +142,8 @@ class Trainer:
             if saved_chunk != chunk:
                 self._save(state, chunk)
         progress.close()
+        if hasattr(state, "replay"):
+            state = state.replace(replay=())  # saved, and not looked at again
         for recorder, own in zip(self.recorders, self._split(state), strict=True):
             recorder.end(own, chunk * self.steps_per_chunk)
             if interrupt.signal_name:
@@ -170,25 +170,34 @@ class Trainer:
         like = jax.eval_shape(init, key)
         if len(keys) > 1:
             like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), like)
-        states, facts = zip(*(recorder.restore(like) for recorder in self.recorders), strict=True)
+        states, facts = [], []
+        for recorder in self.recorders:
+            state, fact = recorder.restore(like)
+            facts.append(fact)
+            # Through the host, where there is room for all of them twice.
+            states.append(state if len(keys) == 1 else jax.device_get(state))
         steps = {fact["env_steps"] for fact in facts}
         if len(steps) > 1:
             at = ", ".join(f"{step:,}" for step in sorted(steps))
-            raise UserError(f"the seeds stand at different steps ({at}); resume each alone (compare: together=1)")
-        self._seconds_before = facts[0]["wall_seconds"]
-        state = states[0] if len(states) == 1 else jax.tree.map(lambda *x: jnp.stack(x), *states)
+            raise UserError(f"the seeds stand at different steps ({at}); resume each alone")
+        self._seconds_before = max(fact["wall_seconds"] for fact in facts)
+        state = states[0] if len(states) == 1 else jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *states)
         return state, steps.pop() // self.steps_per_chunk
 
-    def _split(self, state: TrainState) -> Any:
-        """The TrainState of each run, one after the other."""
+    def _split(self, state: TrainState) -> list[TrainState]:
+        """The TrainState of each run; of several, on the host, where a replay more takes nothing from training."""
         if len(self.recorders) == 1:
-            return iter([state])
-        return (jax.tree.map(lambda x, i=i: x[i], state) for i in range(len(self.recorders)))
+            return [state]
+        state = jax.device_get(state)
+        return [jax.tree.map(lambda x, i=i: x[i], state) for i in range(len(self.recorders))]
 
     def _rows(self, chunk: int, metrics: Metrics) -> list[Row]:
         metrics = jax.device_get(metrics)
         common = {"env_steps": chunk * self.steps_per_chunk, "wall_seconds": self._seconds()}
-        speed = {"speed/steps_per_second": self._speed(chunk)}
+        speed = {
+            "speed/steps_per_second": self._speed(chunk),
+            "speed/seeds_together": float(len(self.recorders)),
+        }
         rows = []
         for i in range(len(self.recorders)):
             own = metrics if len(self.recorders) == 1 else {name: value[:, i] for name, value in metrics.items()}

@@ -180,7 +180,7 @@ def make_on_policy(
             return networks.to_env_action(task, action + noise), extras
 
         def lost_value(outcome, truncated):
-            """Values of observations that a time limit cut off; computed only at steps where there are any."""
+            """Values of observations that a time limit cut off; of one seed, computed only where there are any."""
             return jax.lax.cond(
                 truncated.any(),
                 lambda obs: nets.value_network.apply(state.normalizer, state.params.value, obs),
@@ -263,6 +263,16 @@ def after_update(
         key=key,
         updates=state.updates + 1,
     )
+
+
+def require_several_gradient_steps(config: OnPolicyConfig, num_gradient_steps: int) -> None:
+    """Check that a rate that is to adapt to the KL has one to adapt to.
+
+    Raises:
+        UserError: a batch's only gradient step is taken where the policy has not moved yet.
+    """
+    if config.learning_rate_schedule == "adaptive_kl" and num_gradient_steps == 1:
+        raise UserError("algo.learning_rate_schedule=adaptive_kl needs algo.num_minibatches of 2 or more")
 
 
 def require_whole_minibatches(num_envs: int, num_unrolls: int, num_minibatches: int) -> None:

@@ -18,6 +18,7 @@ from mjx_walk.on_policy import (
     OnPolicyState,
     after_update,
     learning_rates,
+    require_several_gradient_steps,
 )
 from mjx_walk.optimizers import descend
 from mjx_walk.schedules import factor
@@ -40,17 +41,15 @@ def check_minibatches(num_steps: int, config: PolicyGradientConfig) -> None:
     """Check that a batch of `num_steps` steps can be learned from as the settings say.
 
     Raises:
-        UserError: there are fewer than minibatches; or the rate is to adapt to the KL, of which a single gradient step
-            knows nothing.
+        UserError: there are fewer than minibatches; or see `require_several_gradient_steps`.
     """
     if num_steps < config.num_minibatches:
         raise UserError(f"algo.num_minibatches={config.num_minibatches} is more than the {num_steps} steps of a batch")
-    if config.learning_rate_schedule == "adaptive_kl" and config.num_minibatches == 1:
-        raise UserError("algo.learning_rate_schedule=adaptive_kl needs algo.num_minibatches of 2 or more")
+    require_several_gradient_steps(config, config.num_minibatches)
 
 
-class Steps(NamedTuple):
-    """What is learned from, step by step, `[S, …]`."""
+class Samples(NamedTuple):
+    """Steps of a batch that are learned from, `[S, …]`."""
 
     observation: jax.Array
     raw_action: jax.Array
@@ -63,9 +62,9 @@ class Steps(NamedTuple):
     """For the value network; empty where there is none."""
 
 
-def flatten(steps: Steps) -> Steps:
+def flatten(samples: Samples) -> Samples:
     """`[T, N, …]` or `[N, T, …]` to `[S, …]`."""
-    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), steps)
+    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), samples)
 
 
 def learn_once(
@@ -73,8 +72,8 @@ def learn_once(
     config: PolicyGradientConfig,
     state: OnPolicyState,
     batch: OnPolicyBatch,
-    steps: Steps,
-    value_loss: Callable[[Any, RunningStatisticsState, Steps], tuple[jax.Array, Metrics]],
+    samples: Samples,
+    value_loss: Callable[[Any, RunningStatisticsState, Samples], tuple[jax.Array, Metrics]],
 ) -> tuple[OnPolicyState, Metrics]:
     """One pass over a batch in minibatches, each step used for one gradient step, under the normalizer that acted.
 
@@ -83,7 +82,7 @@ def learn_once(
         config: settings.
         state: before.
         batch: as collected.
-        steps: of the batch, each used for one gradient step; up to `num_minibatches - 1` are left over.
+        samples: of the batch; up to `num_minibatches - 1` are left over.
         value_loss: `(params, normalizer, minibatch) → (loss to be added, metrics)`.
 
     Returns:
@@ -96,7 +95,7 @@ def learn_once(
 
     distribution = ground.nets.parametric_action_distribution
 
-    def loss(params, part: Steps, key):
+    def loss(params, part: Samples, key):
         logits = ground.nets.policy_network.apply(state.normalizer, params.policy, part.observation)
         log_prob = distribution.log_prob(logits, part.raw_action)
         entropy = distribution.entropy(logits, key).mean()
@@ -109,13 +108,13 @@ def learn_once(
     def minibatch(carry, inputs):
         params, opt_state = carry
         rows, key = inputs
-        part = jax.tree.map(lambda x: x[rows], steps)
+        part = jax.tree.map(lambda x: x[rows], samples)
         (total, metrics), grads = jax.value_and_grad(loss, has_aux=True)(params, part, key)
         metrics |= {"loss": total, "grad_norm": optax.global_norm(grads)}
         return descend(ground.optimizer, params, grads, opt_state, rates), metrics
 
-    num_steps = steps.weight.size // config.num_minibatches * config.num_minibatches
-    rows = jax.random.permutation(shuffle_key, steps.weight.size)[:num_steps].reshape((config.num_minibatches, -1))
+    num_steps = samples.weight.size // config.num_minibatches * config.num_minibatches
+    rows = jax.random.permutation(shuffle_key, samples.weight.size)[:num_steps].reshape((config.num_minibatches, -1))
     keys = jax.random.split(loss_key, config.num_minibatches)
     (params, optimizer), metrics = jax.lax.scan(minibatch, (state.params, state.optimizer), (rows, keys))
     normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)

@@ -16,20 +16,18 @@ from mjx_walk.types import Algorithm, TrainState
 class Recorder:
     """The disk's side of one run."""
 
-    def __init__(self, config: Config, task: Task, algorithm: Algorithm, folder: RunFolder, seeds_together: int):
+    def __init__(self, config: Config, task: Task, algorithm: Algorithm, folder: RunFolder):
         """
         Args:
             config: checked configuration.
             task: the unbatched environment.
             algorithm: of this run alone.
             folder: prepared run folder.
-            seeds_together: runs that share the device in one program, this one included.
         """
         self.config = config
         self._task = task
         self._algorithm = algorithm
         self._folder = folder
-        self._seeds_together = seeds_together
         self._saver = checkpoint.BackgroundSaver(folder.checkpoints, config.checkpoint.keep)
         self._best_update = -1
         self._writer: MetricsWriter | None = None
@@ -96,12 +94,7 @@ class Recorder:
             if not scored or facts["eval_return"] > scored[0][0].mean:
                 scored.append((self._score_in_gymnasium(params, num_episodes), params, facts))
         scores, params, facts = max(scored, key=lambda candidate: candidate[0].mean)
-        scores.save(
-            self._folder.gymnasium_scores,
-            env_steps=facts["env_steps"],
-            wall_seconds=wall_seconds,
-            seeds_together=self._seeds_together,
-        )
+        scores.save(self._folder.gymnasium_scores, env_steps=facts["env_steps"], wall_seconds=wall_seconds)
         self._saver.save((self._folder.best_policy, params, facts))
         return scores
 

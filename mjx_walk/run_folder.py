@@ -4,6 +4,7 @@ import dataclasses
 import datetime
 from pathlib import Path
 
+from mjx_walk.checkpoint import list_steps
 from mjx_walk.config import Config, flatten, read_config, save_config
 from mjx_walk.errors import UserError
 
@@ -56,52 +57,72 @@ def open_existing(path: str | Path) -> RunFolder:
     return folder
 
 
-def prepare(config: Config) -> tuple[RunFolder, Config]:
-    """The folder to train in, made or resumed. Nothing that is there is overwritten.
+def prepare(configs: list[Config]) -> tuple[list[RunFolder], list[Config]]:
+    """The folders to train in side by side, made or resumed. All are looked at before any is touched, and nothing that
+    is there is overwritten.
+
+    Args:
+        configs: of the runs, which may differ in `seed` and `run_dir`.
 
     Returns:
-        The folder, and the configuration with `run_dir` filled in.
+        The folders, and the configurations with `run_dir` filled in.
 
     Raises:
-        UserError: the folder holds something else, or another run; or, to resume, another configuration.
+        UserError: a folder holds something else, or another run; or, to resume, another configuration, or runs that
+            cannot go on side by side.
     """
-    if config.run_dir is None:
-        if config.resume:
+    first = configs[0]
+    if first.run_dir is None:
+        if first.resume:
             raise UserError("resume=true needs run_dir=PATH of the run to go on with")
-        config = dataclasses.replace(config, run_dir=str(new_path(config)))
-    folder = RunFolder(Path(str(config.run_dir)))
-    if folder.path.exists() and not folder.path.is_dir():
-        raise UserError(f"run_dir={config.run_dir} is a file; choose another path")
-    if config.resume:
-        return folder, _check_same_run(open_existing(folder.path), config)
-    if folder.config.exists():
-        raise UserError(f"run_dir={config.run_dir} holds a run already; add resume=true, or choose another path")
-    if folder.path.exists() and any(folder.path.iterdir()):
-        raise UserError(f"run_dir={config.run_dir} exists and is not a run folder; choose another path")
-    try:
-        folder.checkpoints.mkdir(parents=True)
-        save_config(config, folder.config)
-    except OSError as error:
-        raise UserError(f"cannot write to run_dir={config.run_dir}: {error.strerror}") from error
-    return folder, config
+        configs = [dataclasses.replace(config, run_dir=str(new_path(config))) for config in configs]
+    folders = [RunFolder(Path(str(config.run_dir))) for config in configs]
+    for folder, config in zip(folders, configs, strict=True):
+        _check(folder, config)
+        differing = differences(first, config, besides=("run_dir", "resume", "seed"))
+        if differing:
+            raise UserError(f"{folder.path} and {folders[0].path} differ in {'; '.join(differing)}; resume each alone")
+    steps = {_newest(folder) for folder in folders}
+    if len(steps) > 1:
+        raise UserError(f"the seeds stand at different steps ({', '.join(sorted(steps))}); resume each alone")
+    for folder, config in zip(folders, configs, strict=True):
+        try:
+            folder.checkpoints.mkdir(parents=True, exist_ok=config.resume)
+            save_config(config, folder.config)
+        except OSError as error:
+            raise UserError(f"cannot write to run_dir={config.run_dir}: {error.strerror}") from error
+    return folders, configs
 
 
-def differences(saved: Config, config: Config) -> list[str]:
-    """The settings in which a run differs from what is asked for now, beside those that may."""
+def differences(saved: Config, config: Config, besides: tuple[str, ...] = MAY_DIFFER) -> list[str]:
+    """The settings in which a run differs from what is asked for now, or from another one."""
     old, new = flatten(saved), flatten(config)
     return [
         f"{key} (was {old.get(key)}, now {new.get(key)})"
         for key in sorted(old.keys() | new.keys())
-        if key not in MAY_DIFFER and old.get(key) != new.get(key)
+        if key not in besides and old.get(key) != new.get(key)
     ]
 
 
-def _check_same_run(folder: RunFolder, config: Config) -> Config:
-    saved = read_config(folder.config)
+def _check(folder: RunFolder, config: Config) -> None:
+    """That a run may begin, or go on, in a folder."""
+    if folder.path.exists() and not folder.path.is_dir():
+        raise UserError(f"run_dir={config.run_dir} is a file; choose another path")
+    if not config.resume:
+        if folder.config.exists():
+            raise UserError(f"run_dir={config.run_dir} holds a run already; add resume=true, or choose another path")
+        if folder.path.exists() and any(folder.path.iterdir()):
+            raise UserError(f"run_dir={config.run_dir} exists and is not a run folder; choose another path")
+        return
+    saved = read_config(open_existing(folder.path).config)
     differing = differences(saved, config)
     if differing:
         raise UserError(f"resume=true with another configuration than {folder.config}: {'; '.join(differing)}")
     if config.total_steps < saved.total_steps:
         raise UserError(f"total_steps={config.total_steps} is below this run's {saved.total_steps}; it may only grow")
-    save_config(config, folder.config)
-    return config
+
+
+def _newest(folder: RunFolder) -> str:
+    """The steps behind the newest checkpoint."""
+    saved = list_steps(folder.checkpoints)
+    return f"{int(saved[-1].name):,}" if saved else "0"

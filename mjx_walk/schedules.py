@@ -12,7 +12,8 @@ def anneal(steps: jax.Array, horizon: int) -> jax.Array:
 def adapt_rate(rate: jax.Array, kl: jax.Array, target: float) -> jax.Array:
     """The learning rate that holds the policy's KL from the one that acted near a target.
 
-    Source: rsl_rl: ÷ 1.5 above twice the target, × 1.5 below half of it; within 1e-6, not its 1e-5, and 1e-2.
+    Source: rsl_rl: ÷ 1.5 above twice the target, × 1.5 below half of it. Deviations: once a batch, not at each
+    minibatch; within 1e-6, not 1e-5, and 1e-2.
     """
     slower = jnp.where(kl > 2.0 * target, rate / 1.5, rate)
     faster = jnp.where((kl < 0.5 * target) & (kl > 0.0), slower * 1.5, slower)

@@ -212,6 +212,7 @@ def test_seeds_that_stand_at_the_same_step_are_trained_together(tmp_path):
 
     assert names(3) == [["ppo/seed_0", "ppo/seed_2"], ["a2c/seed_0", "a2c/seed_1", "a2c/seed_2"], ["ppo/seed_1"]]
     assert names(2)[1:] == [["a2c/seed_0", "a2c/seed_1"], ["ppo/seed_1"], ["a2c/seed_2"]]
+    assert [cells.most_together(planned, slots) for slots in (1, 3, 4, 8)] == [3, 3, 2, 1]
     assert names(1)[:3] == [["ppo/seed_0"], ["a2c/seed_0"], ["ppo/seed_1"]]
 
 

@@ -7,6 +7,10 @@ import pytest
 from commands import TINY, TINY_CHUNK, TINY_OFF_POLICY
 from test_resume import leaves, train
 
+from mjx_walk import train as train_command
+from mjx_walk.config import load_config, save_config
+from mjx_walk.errors import UserError
+
 SEEDS = "seeds=[3,5]"
 
 
@@ -19,23 +23,31 @@ def assert_alike(run, other, exactly):
             np.testing.assert_allclose(leaf, other[name], rtol=1e-2, atol=1e-2, err_msg=name)
 
 
+def moved(run_dir):
+    """How the parameters of the policy moved in the second chunk, in one vector."""
+    before, after = leaves(run_dir, 1), leaves(run_dir, 2)
+    names = [name for name in after if ".policy.params." in name and "optimizer" not in name]
+    assert len(names) >= 4
+    return np.concatenate([np.ravel(after[name] - before[name]) for name in names])
+
+
 @pytest.mark.parametrize(("algo", "tiny"), [("ppo", TINY), ("sac", TINY_OFF_POLICY)])
 def test_seeds_side_by_side_are_the_runs_of_each(tmp_path, algo, tiny):
-    settings = [f"algo={algo}", f"total_steps={2 * TINY_CHUNK}"]
-    train(tmp_path / "both", *settings, SEEDS, "evaluation.gymnasium_episodes=1", tiny=tiny)
+    settings = [f"algo={algo}", f"total_steps={2 * TINY_CHUNK}", "checkpoint.every_chunks=1"]
+    tiny = [setting for setting in tiny if "every_chunks" not in setting]
+    train(tmp_path / "both", *settings, SEEDS, tiny=tiny)
     train(tmp_path / "alone", *settings, "seed=5", tiny=tiny)
-    both = {seed: leaves(tmp_path / "both" / f"seed_{seed}", 2) for seed in (3, 5)}
-    assert_alike(both[5], leaves(tmp_path / "alone", 2), exactly=False)
-    assert not np.array_equal(both[3]["env.live.env.physics.qpos"], both[5]["env.live.env.physics.qpos"])
+    assert_alike(leaves(tmp_path / "both" / "seed_5", 2), leaves(tmp_path / "alone", 2), exactly=False)
+    one, other, alone = (moved(tmp_path / name) for name in ("both/seed_5", "both/seed_3", "alone"))
+    assert np.linalg.norm(one - alone) < 0.3 * np.linalg.norm(alone) < np.linalg.norm(other - alone)
     rows = [
         [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
         for run in (tmp_path / "both" / "seed_5", tmp_path / "alone")
     ]
-    for together, alone in zip(*rows, strict=True):
-        assert together.keys() == alone.keys() and together["env_steps"] == alone["env_steps"]
-        assert together["episode/count"] == alone["episode/count"]
-    scores = [json.loads((tmp_path / "both" / f"seed_{seed}" / "eval_gymnasium.json").read_text()) for seed in (3, 5)]
-    assert [score["seeds_together"] for score in scores] == [2, 2] and scores[0]["mean"] != scores[1]["mean"]
+    for together, apart in zip(*rows, strict=True):
+        assert together.keys() == apart.keys() and together["env_steps"] == apart["env_steps"]
+        assert together["episode/count"] == apart["episode/count"]
+        assert (together["speed/seeds_together"], apart["speed/seeds_together"]) == (2, 1)
 
 
 def test_seeds_side_by_side_resume_exactly_and_each_may_go_on_alone(tmp_path):
@@ -49,5 +61,27 @@ def test_seeds_side_by_side_resume_exactly_and_each_may_go_on_alone(tmp_path):
     train(tmp_path / "one", f"total_steps={2 * TINY_CHUNK}", SEEDS)
     train(tmp_path / "one" / "seed_5", *further, tiny=[])
     assert_alike(leaves(tmp_path / "whole" / "seed_5", 4), leaves(tmp_path / "one" / "seed_5", 4), exactly=False)
+    with pytest.raises(AssertionError, match=r"differ in total_steps \(was 128, now 256\); resume each alone"):
+        train(tmp_path / "one", "resume=true", SEEDS, tiny=[])
+    before = (tmp_path / "one" / "seed_3" / "config.yaml").read_text()
     with pytest.raises(AssertionError, match=r"error: the seeds stand at different steps \(128, 256\); resume"):
         train(tmp_path / "one", f"total_steps={6 * TINY_CHUNK}", "resume=true", SEEDS, tiny=[])
+    assert (tmp_path / "one" / "seed_3" / "config.yaml").read_text() == before
+
+
+def test_nothing_is_begun_where_one_seed_cannot_be(tmp_path, monkeypatch):
+    """A folder that is there already; runs of other settings."""
+    monkeypatch.chdir(tmp_path)
+    save(tmp_path / "x" / "seed_5", "seed=5", "run_dir=x/seed_5")
+    with pytest.raises(UserError, match=r"run_dir=x/seed_5 holds a run already; add resume=true"):
+        train_command.main([*TINY, SEEDS, "run_dir=x"])
+    assert not (tmp_path / "x" / "seed_3").exists()
+    save(tmp_path / "x" / "seed_3", "seed=3", "run_dir=x/seed_3", "algo.discount=0.5")
+    with pytest.raises(UserError, match=r"differ in algo.discount \(was 0.5, now 0.99\); resume each alone"):
+        train_command.main(["resume=true", "run_dir=x", SEEDS])
+
+
+def save(run_dir, *overrides):
+    """A run folder with nothing but its configuration."""
+    run_dir.mkdir(parents=True)
+    save_config(load_config([*TINY, "physics=c", *overrides]), run_dir / "config.yaml")

@@ -10,7 +10,7 @@ from mjx_walk.envs import Task
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.noise import OrnsteinUhlenbeck
 from mjx_walk.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
-from mjx_walk.policy_gradient import PolicyGradientConfig, Steps, check_minibatches, flatten, learn_once, normalize
+from mjx_walk.policy_gradient import PolicyGradientConfig, Samples, check_minibatches, flatten, learn_once, normalize
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -43,9 +43,9 @@ def make_a2c(task: Task, num_envs: int, evaluation: EvaluationConfig, config: A2
     ground = make_on_policy(task, num_envs, evaluation, config, exploration=exploration)
     value_network = ground.nets.value_network
 
-    def value_loss(params, normalizer, steps: Steps) -> tuple[jax.Array, Metrics]:
-        values = value_network.apply(normalizer, params.value, steps.observation)
-        loss = jnp.square(steps.target - values).mean()
+    def value_loss(params, normalizer, samples: Samples) -> tuple[jax.Array, Metrics]:
+        values = value_network.apply(normalizer, params.value, samples.observation)
+        loss = jnp.square(samples.target - values).mean()
         return config.value_cost * loss, {"value_loss": loss}
 
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
@@ -66,7 +66,7 @@ def make_a2c(task: Task, num_envs: int, evaluation: EvaluationConfig, config: A2
         if config.normalize_advantages:
             advantages = normalize(advantages, weight)
         acted = data.extras["policy_extras"]
-        steps = Steps(data.observation, acted["raw_action"], acted["log_prob"], advantages, weight, targets)
-        return learn_once(ground, config, state, batch, flatten(steps), value_loss)
+        samples = Samples(data.observation, acted["raw_action"], acted["log_prob"], advantages, weight, targets)
+        return learn_once(ground, config, state, batch, flatten(samples), value_loss)
 
     return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)

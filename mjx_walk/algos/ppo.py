@@ -18,6 +18,7 @@ from mjx_walk.on_policy import (
     after_update,
     learning_rates,
     make_on_policy,
+    require_several_gradient_steps,
     require_whole_minibatches,
 )
 from mjx_walk.optimizers import descend
@@ -46,9 +47,10 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
         config: settings.
 
     Raises:
-        UserError: the batch does not divide into the minibatches.
+        UserError: the batch does not divide into the minibatches; or see `require_several_gradient_steps`.
     """
     require_whole_minibatches(num_envs, config.num_unrolls, config.num_minibatches)
+    require_several_gradient_steps(config, config.num_epochs * config.num_minibatches)
     ground = make_on_policy(task, num_envs, evaluation, config)
     nets = ground.nets
 

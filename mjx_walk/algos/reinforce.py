@@ -10,7 +10,7 @@ from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
-from mjx_walk.policy_gradient import PolicyGradientConfig, Steps, check_minibatches, flatten, learn_once, normalize
+from mjx_walk.policy_gradient import PolicyGradientConfig, Samples, check_minibatches, flatten, learn_once, normalize
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -68,9 +68,10 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
         # Of these steps, only those before a time limit can have too much unseen.
         weight = jnp.float32(config.max_unseen >= unseen.T[:, :num_learned])
         advantage = normalize(return_to_go.T[:, :num_learned], weight)
+        obs = data.observation[:, :num_learned]
         acted = jax.tree.map(lambda x: x[:, :num_learned], data.extras["policy_extras"])
-        steps = Steps(data.observation[:, :num_learned], acted["raw_action"], acted["log_prob"], advantage, weight, ())
-        new_state, metrics = learn_once(ground, config, state, batch, flatten(steps), no_value_loss)
+        samples = Samples(obs, acted["raw_action"], acted["log_prob"], advantage, weight, target=())
+        new_state, metrics = learn_once(ground, config, state, batch, flatten(samples), no_value_loss)
         return new_state, metrics | {"learned_from": weight.mean() * num_learned / config.unroll_length}
 
     return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)
