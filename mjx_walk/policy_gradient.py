@@ -32,6 +32,8 @@ class PolicyGradientConfig(OnPolicyConfig):
 
     distribution: str = setting("normal", choices=("tanh_normal", "normal"))
     """Squashed, it runs away: nothing holds the mean back where tanh is flat."""
+    mean_bound_cost: float = setting(1.0, at_least=0)
+    """Of the squared distance by which a `normal` distribution's mean leaves [-1, 1], where its samples are clipped."""
     num_unrolls: int = setting(1, at_least=1)
     num_minibatches: int = setting(1, at_least=1)
     """Gradient steps on a batch, each on steps of its own, drawn from all pieces."""
@@ -103,7 +105,12 @@ def learn_once(
         policy_loss = (part.weight * losses).sum() / jnp.maximum(part.weight.sum(), 1.0)
         further_loss, metrics = value_loss(params, state.normalizer, part)
         metrics |= {"policy_loss": policy_loss, "entropy": entropy, "kl": sampled_kl(log_prob, part.acted_log_prob)}
-        return policy_loss + further_loss - entropy_cost * entropy, metrics
+        total = policy_loss + further_loss - entropy_cost * entropy
+        if config.distribution == "normal":
+            mean, _ = logits
+            metrics["mean_out_of_bounds"] = out_of_bounds(mean)
+            total += config.mean_bound_cost * metrics["mean_out_of_bounds"]
+        return total, metrics
 
     def minibatch(carry, inputs):
         params, opt_state = carry
@@ -137,6 +144,15 @@ def policy_gradient_loss(log_prob: jax.Array, acted_log_prob: jax.Array, advanta
     """
     weight = jax.lax.stop_gradient(jnp.minimum(jnp.exp(log_prob - acted_log_prob), _MAX_IMPORTANCE))
     return -weight * advantages * log_prob
+
+
+def out_of_bounds(mean: jax.Array) -> jax.Array:
+    """The squared distance of means, `[…, action_size]`, from [-1, 1], summed over an action and averaged.
+
+    Outside, the noise is clipped away, so that no return depends on it: the means only drift, ever further out, and
+    with them goes what there was to learn from.
+    """
+    return jnp.square(jnp.maximum(jnp.abs(mean) - 1.0, 0.0)).sum(axis=-1).mean()
 
 
 def normalize(values: jax.Array, weight: jax.Array) -> jax.Array:

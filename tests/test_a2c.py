@@ -11,7 +11,7 @@ from mjx_walk.algos.a2c import A2CConfig, make_a2c
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.noise import OrnsteinUhlenbeck
-from mjx_walk.policy_gradient import policy_gradient_loss, sampled_kl
+from mjx_walk.policy_gradient import out_of_bounds, policy_gradient_loss, sampled_kl
 
 NUM_ENVS, STEPS = 16, 6
 GAUSSIAN = {"distribution": "normal", "policy_hidden_layer_sizes": (8,), "value_hidden_layer_sizes": (8,)}
@@ -108,3 +108,9 @@ def test_policy_gradient_is_plain_at_first_and_lets_go_of_what_has_become_unlike
     np.testing.assert_allclose(gradient(acted - 30.0), 0.0, atol=1e-12)
     np.testing.assert_allclose(gradient(acted + 1.0), -jnp.e * advantages, rtol=1e-6)
     np.testing.assert_allclose(gradient(acted + 1e6), -10.0 * advantages)
+
+
+def test_means_are_pulled_back_into_the_bounds_of_actions():
+    mean = jnp.float32([[1.5, -0.5], [-3.0, 2.0]])
+    assert float(out_of_bounds(mean)) == pytest.approx((0.25 + 4.0 + 1.0) / 2)
+    np.testing.assert_allclose(jax.grad(out_of_bounds)(mean), [[0.5, 0.0], [-2.0, 1.0]])
