@@ -142,8 +142,10 @@ def _draw(groups: dict[str, list[Curve]], path: Path) -> None:
                 plot.set_xlabel(label)
     env = next(iter(groups.values()))[0].config.env
     figure.suptitle(f"{env.name} {env.version}: every seed thin, their mean bold, while training")
-    if grid[0][0].get_legend_handles_labels()[0]:
-        grid[0][0].legend(fontsize=8)
+    handles, labels = grid[0][0].get_legend_handles_labels()
+    if handles:
+        columns = max(160 // (len(max(labels, key=len)) + 8), 1)  # as fit side by side
+        figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=9)
     figure.savefig(path, dpi=110)
 
 

@@ -57,7 +57,9 @@ def _through_hydra(arguments: list[str]) -> None:
     parsed = OverridesParser.create().parse_overrides(complete_overrides(overrides))
     plain = [o for o in parsed if not o.is_sweep_override() and not o.key_or_group.startswith("hydra")]
     load_config([str(o.input_line) for o in plain])  # says in one line what Hydra would say in many
-    sys.argv = [sys.argv[0], *arguments, str(parsed[0].input_line)]
+    # Hydra's parser wants all overrides in one row.
+    flags = [argument for argument in arguments if argument not in overrides]
+    sys.argv = [sys.argv[0], *flags, str(parsed[0].input_line), *overrides]
     os.environ["HYDRA_FULL_ERROR"] = "1"
     register_schemas()
     hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")(_sweep_job)()

@@ -1,17 +1,24 @@
 """REINFORCE: its loss worked out by hand, over the steps that it is to learn from."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from toy_tasks import DelayedReward, EndlessReward
 
 from mjx_walk import networks
-from mjx_walk.algos.reinforce import REINFORCEConfig, make_reinforce
+from mjx_walk.algos.reinforce import REINFORCEConfig, linear_fit, make_reinforce
 from mjx_walk.live_evaluation import EvaluationConfig
 
 NUM_ENVS, STEPS, LEARNED = 16, 6, 4
 # What follows the piece counts 0.5³ at the fourth step and 0.5² at the fifth.
-SETTINGS = {"unroll_length": STEPS, "discount": 0.5, "max_unseen": 0.2, "policy_hidden_layer_sizes": (8,)}
+SETTINGS = {
+    "unroll_length": STEPS,
+    "discount": 0.5,
+    "max_unseen": 0.2,
+    "baseline": "mean",
+    "policy_hidden_layer_sizes": (8,),
+}
 
 
 def learned(task, **changes):
@@ -46,3 +53,17 @@ def test_steps_just_before_a_time_limit_are_left_out():
         seen[:, t] = ~cut[:, t : t + 2].any(axis=1)  # at two steps from the cut, the future counts 0.25
     assert 0 < seen.sum() < seen.size
     assert metrics["learned_from"] == pytest.approx(seen.sum() / (NUM_ENVS * STEPS))
+
+
+def test_linear_baseline_is_the_least_squares_fit():
+    """Of what counts; what does not may be anything."""
+    keys = jax.random.split(jax.random.PRNGKey(0), 3)
+    obs, noise = jax.random.normal(keys[0], (64, 8, 3)), jax.random.normal(keys[1], (64, 8))
+    weight = jnp.float32(jax.random.bernoulli(keys[2], 0.7, (64, 8)))
+    target = obs @ jnp.float32([0.6, -0.6, 0.0]) + 0.1 * (jnp.square(obs[..., 2]) - 1.0) + 0.5 * noise
+    fitted = np.asarray(linear_fit(obs, jnp.where(weight, target, 1e3), weight))
+    features = np.concatenate([obs, np.square(obs), np.ones((64, 8, 1))], axis=-1)
+    counts = np.asarray(weight) > 0
+    exact = features @ np.linalg.lstsq(features[counts], np.asarray(target)[counts], rcond=None)[0]
+    np.testing.assert_allclose(fitted[counts], exact[counts], atol=0.05)
+    assert np.std(np.asarray(target)[counts] - fitted[counts]) == pytest.approx(0.5, abs=0.05)

@@ -147,3 +147,10 @@ def test_a_sweep_puts_each_job_in_its_own_folder(tmp_path):
 def test_configuration_can_be_printed(capsys):
     assert train_command.main(["--help"]) == 0
     assert "usage: python -m mjx_walk.train" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [["env=walker2d", "--cfg", "job"], ["algo=sac", "--cfg", "job", "env=walker2d"]])
+def test_flags_may_stand_anywhere(arguments):
+    printed = command("train", *arguments)
+    assert printed.returncode == 0, printed.stderr
+    assert "name: walker2d" in printed.stdout
