@@ -99,6 +99,7 @@ class Trainer:
         self.steps_per_chunk = alone.steps_per_update * config.updates_per_chunk
         self.num_chunks = -(-config.total_steps // self.steps_per_chunk)
         self._chunk = make_chunk(self.algorithm, config.updates_per_chunk, fused=task.engine.name != "c")
+        self._are_sound = jax.jit(self._has_finite_policy if len(configs) == 1 else jax.vmap(self._has_finite_policy))
         self._on_metrics = on_metrics or (lambda row: None)
         self._started = time.monotonic()
         self._times: collections.deque[tuple[float, int]] = collections.deque()
@@ -110,6 +111,9 @@ class Trainer:
 
         Returns:
             None at the end, else the name of the signal; the states are saved either way.
+
+        Raises:
+            UserError: a policy is not finite any more.
         """
         state, chunk = self._start()
         progress = Progress(self.num_chunks * self.steps_per_chunk, chunk * self.steps_per_chunk)
@@ -117,10 +121,14 @@ class Trainer:
         self._times.append((time.monotonic(), chunk))
         for recorder in self.recorders:
             recorder.begin(chunk * self.steps_per_chunk, trains_on=chunk < self.num_chunks)
-        pending: tuple[int, Metrics] | None = None
+        pending: tuple[int, Metrics, jax.Array] | None = None
+        diverged: set[int] = set()
 
-        def log(chunk: int, metrics: Metrics) -> None:
+        def log(chunk: int, metrics: Metrics, are_sound: jax.Array) -> None:
             rows = self._rows(chunk, metrics)
+            for recorder, is_sound in zip(self.recorders, np.atleast_1d(are_sound), strict=True):
+                if not is_sound:
+                    diverged.add(recorder.config.seed)
             for recorder, row in zip(self.recorders, rows, strict=True):
                 recorder.write(row)
                 self._warn_of_overflow(row)
@@ -128,12 +136,12 @@ class Trainer:
             progress.update(_mean_row(rows))
 
         with Interrupt() as interrupt:
-            while chunk < self.num_chunks and not interrupt.signal_name:
+            while chunk < self.num_chunks and not interrupt.signal_name and not diverged:
                 state, metrics = self._chunk(state)
                 if pending:  # fetched while the next chunk runs
                     log(*pending)
                 chunk += 1
-                pending = (chunk, metrics)
+                pending = (chunk, metrics, self._are_sound(state))
                 if chunk % self.config.checkpoint.every_chunks == 0:
                     self._save(state, chunk)
                     saved_chunk = chunk
@@ -146,8 +154,14 @@ class Trainer:
             state = state.replace(replay=())  # saved, and not looked at again
         for recorder, own in zip(self.recorders, self._split(state), strict=True):
             recorder.end(own, chunk * self.steps_per_chunk)
-            if interrupt.signal_name:
+            if interrupt.signal_name or diverged:
                 recorder.wait()
+        if diverged:
+            raise UserError(
+                f"training has diverged: after {chunk * self.steps_per_chunk:,} steps the policy of seed "
+                f"{', '.join(map(str, sorted(diverged)))} is not finite any more; checkpoints from before are kept; "
+                "lower the learning rate, or clip gradients"
+            )
         return interrupt.signal_name
 
     def score(self) -> None:
@@ -227,8 +241,15 @@ class Trainer:
         return self._seconds_before + time.monotonic() - self._started
 
     def _save(self, state: TrainState, chunk: int) -> None:
-        for recorder, own in zip(self.recorders, self._split(state), strict=True):
-            recorder.save(own, chunk * self.steps_per_chunk, self._seconds())
+        """Save the TrainState of every run whose policy is finite."""
+        are_sound = np.atleast_1d(self._are_sound(state))
+        for recorder, own, is_sound in zip(self.recorders, self._split(state), are_sound, strict=True):
+            if is_sound:
+                recorder.save(own, chunk * self.steps_per_chunk, self._seconds())
+
+    def _has_finite_policy(self, state: TrainState) -> jax.Array:
+        leaves = jax.tree.leaves(self.algorithm.policy_params(state))
+        return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in leaves]))
 
 
 def _mean_row(rows: list[Row]) -> Row:

@@ -5,16 +5,19 @@ import math
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import TINY, TINY_CHUNK, command
 from tensorboardX.proto.event_pb2 import Event
 
 import mjx_walk
+from mjx_walk import loop
 from mjx_walk import train as train_command
 from mjx_walk.algos import make_algorithm
 from mjx_walk.api import make_task
 from mjx_walk.config import load_config
+from mjx_walk.errors import UserError
 from mjx_walk.loop import make_chunk, make_init
 
 
@@ -142,6 +145,35 @@ def test_a_sweep_puts_each_job_in_its_own_folder(tmp_path):
     done = command("train", "-m", "num_envs=7,8", *arguments[:1], *arguments[2:], cwd=tmp_path)
     assert done.returncode == 2 and "choose num_envs a multiple of 2" in done.stderr and "Traceback" not in done.stderr
     assert len(list(tmp_path.glob("runs/sweeps/*/*/metrics.jsonl"))) == 3
+
+
+def test_training_that_diverges_stops_and_keeps_what_was_saved_before(tmp_path):
+    run, steps = tmp_path / "run", f"total_steps={50 * TINY_CHUNK}"
+    arguments = [*TINY, f"run_dir={run}", "checkpoint.every_chunks=1", steps]
+    with pytest.raises(UserError, match=r"training has diverged: .* the policy of seed 0 is not finite"):
+        train_command.main([*arguments, "algo.learning_rate=1e30"])
+    assert 1 <= len((run / "metrics.jsonl").read_text().splitlines()) <= 3
+    assert not list((run / "checkpoints").iterdir())
+
+
+def test_of_seeds_side_by_side_those_that_are_sound_are_saved(tmp_path, monkeypatch):
+    """The second one's policy is broken from the start."""
+
+    def broken(algorithm):
+        init = make_init(algorithm)
+
+        def break_second(key):
+            state = init(key)
+            policy = jax.tree.map(lambda x: x.at[1].set(jnp.nan), state.params.policy)
+            return state.replace(params=state.params.replace(policy=policy))
+
+        return break_second
+
+    monkeypatch.setattr(loop, "make_init", broken)
+    with pytest.raises(UserError, match="the policy of seed 5 is not finite"):
+        train_command.main([*TINY, f"run_dir={tmp_path}", "seeds=[3,5]", f"total_steps={50 * TINY_CHUNK}"])
+    assert len(list((tmp_path / "seed_3" / "checkpoints").glob("0*"))) == 1
+    assert not list((tmp_path / "seed_5" / "checkpoints").iterdir())
 
 
 def test_configuration_can_be_printed(capsys):

@@ -5,7 +5,6 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from brax.training.acme import running_statistics
 
 from mjx_walk import returns
 from mjx_walk.envs import Task
@@ -74,8 +73,7 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
         advantage, obs = return_to_go.T[:, :num_learned], data.observation[:, :num_learned]
         advantage = normalize(advantage, weight)
         if config.baseline == "linear":
-            normalized = running_statistics.normalize(obs, state.normalizer, max_abs_value=_LARGEST)
-            advantage = normalize(advantage - linear_fit(normalized, advantage, weight), weight)
+            advantage = normalize(advantage - linear_fit(obs, advantage, weight), weight)
         acted = jax.tree.map(lambda x: x[:, :num_learned], data.extras["policy_extras"])
         samples = Samples(obs, acted["raw_action"], acted["log_prob"], advantage, weight, target=())
         new_state, metrics = learn_once(ground, config, state, batch, flatten(samples), no_value_loss)
@@ -85,9 +83,9 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
 
 
 _LARGEST = 5.0
-"""Of normalised observations in the fit, so that a few do not rule it."""
-_RIDGE = 1e-3
-"""Small beside the features' variance, and enough for 32-bit floats."""
+"""Of features in the fit, in standard deviations, so that a few do not rule it."""
+_RIDGE = 1e-2
+"""Small beside the features' variance of 1, and enough for features that say the same in 32-bit floats."""
 
 
 def linear_fit(obs: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
@@ -97,16 +95,22 @@ def linear_fit(obs: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Arra
     control". Deviations: no powers of time, since nothing in these tasks depends on it; fitted to the batch itself.
 
     Args:
-        obs: `[N, T, observation_size]`, normalised.
-        target: `[N, T]`, normalised.
+        obs: `[N, T, observation_size]`, unnormalised.
+        target: `[N, T]`, of mean 0.
         weight: `[N, T]`, 0 where a target does not count.
 
     Returns:
         `[N, T]`.
     """
-    features = jnp.concatenate([obs, jnp.square(obs) / _LARGEST, jnp.ones((*obs.shape[:-1], 1))], axis=-1)
+    features = jnp.concatenate([standardize(obs), standardize(jnp.square(standardize(obs)))], axis=-1)
     product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
-    ridge = _RIDGE * weight.sum() * jnp.eye(features.shape[-1])
+    ridge = _RIDGE * jnp.maximum(weight.sum(), 1.0) * jnp.eye(features.shape[-1])
     gram = product("nt,ntf,ntg->fg", weight, features, features) + ridge
     moment = product("nt,ntf,nt->f", weight, features, target)
     return product("ntf,f->nt", features, jax.scipy.linalg.solve(gram, moment, assume_a="pos"))
+
+
+def standardize(features: jax.Array) -> jax.Array:
+    """To mean 0 and std 1 over all but the last axis, and within bounds; what does not vary becomes 0."""
+    mean, std = features.mean(axis=(0, 1)), features.std(axis=(0, 1))
+    return jnp.clip((features - mean) / (std + 1e-4), -_LARGEST, _LARGEST)
