@@ -40,7 +40,7 @@ CASES = [
     (["env.xml_file=nowhere.xml"], "model file not found"),
     (["algo=sac", "algo.replay_capacity=10_000_000_000"], "lower algo.replay_capacity"),
     (["algo=sac", "algo.replay_capacity=1000"], "algo.prefill_steps=10000 is more than algo.replay_capacity"),
-    (["algo=reinforce", "algo.discount=0.999"], "above algo.max_unseen=0.05; lengthen it, or lower algo.discount"),
+    (["algo=reinforce", "algo.discount=0.999"], "above algo.max_unseen=0.2; lengthen it, or lower algo.discount"),
     (["algo=a2c", "algo.min_log_std=3"], "algo.min_log_std=3.0 is above algo.max_log_std=2.0"),
     (["env.reward_function=mine.py:f"], "no file 'mine.py'; write PATH.py:FUNCTION"),
     (["env.shaping.faling=1"], "unknown key 'env.shaping.faling'; did you mean: env.shaping.falling"),
