@@ -22,6 +22,7 @@ from mjx_walk.loop import Trainer
 from mjx_walk.metrics import Row, read_rows
 from mjx_walk.policies import deterministic_act, load_best_policy
 from mjx_walk.run_folder import MAY_DIFFER, RunFolder
+from mjx_walk.team import Team
 
 
 class Run:
@@ -111,12 +112,15 @@ def resolve_seeds(overrides: list[str], seeds: list[int]) -> list[Config]:
     return [_as_saved(config, overrides) for config in with_seeds]
 
 
-def train(configs: list[Config], on_metrics: Callable[[Row], None] | None = None) -> tuple[list[RunFolder], str | None]:
+def train(
+    configs: list[Config], on_metrics: Callable[[Row], None] | None = None, team: Team | None = None
+) -> tuple[list[RunFolder], str | None]:
     """Train one run, or several that differ in their seed alone side by side; then score them in the real Gymnasium.
 
     Args:
         configs: checked configurations, alike but for `seed` and `run_dir`.
         on_metrics: called with every row that is logged.
+        team: the processes that train one run together; this is one of them.
 
     Returns:
         The run folders, and the name of the signal that stopped them early, if one did.
@@ -129,13 +133,18 @@ def train(configs: list[Config], on_metrics: Callable[[Row], None] | None = None
     # Refuses what does not fit before a folder is made.
     algorithm = make_algorithm(task, configs[0].num_envs, configs[0].evaluation, configs[0].algo)
     replay = check_replay(algorithm, Path(configs[0].run_dir or "."), len(configs))
-    folders, configs = run_folder.prepare(configs)
-    _announce(configs[0], folders)
-    if replay:
-        print(replay, flush=True)
-    trainer = Trainer(configs, task, folders, on_metrics)
+    is_first = not team or team.rank == 0
+    if is_first:
+        folders, configs = run_folder.prepare(configs)
+        _announce(configs[0], folders, team.size if team else 1)
+        if replay:
+            print(replay, flush=True)
+    if team:
+        path = team.first_ones(str(folders[0].path.absolute()) if is_first else "")
+        folders = [RunFolder(Path(path))]
+    trainer = Trainer(configs, task, folders, on_metrics, team)
     signal_name = trainer.train()
-    if signal_name:
+    if signal_name and is_first:
         where = f"run_dir={folders[0].path}"
         if len(folders) > 1:
             where = f"run_dir={folders[0].path.parent} 'seeds={[config.seed for config in configs]}'"
@@ -143,7 +152,7 @@ def train(configs: list[Config], on_metrics: Callable[[Row], None] | None = None
             f"Stopped by {signal_name} and saved. To go on: python -m mjx_walk.train {where} resume=true",
             flush=True,
         )
-    else:
+    elif not signal_name:
         trainer.score()
     return folders, signal_name
 
@@ -180,9 +189,10 @@ def _without_lost_reward(config: Config) -> Config:
     return dataclasses.replace(config, env=dataclasses.replace(config.env, reward_function=None))
 
 
-def _announce(config: Config, folders: list[RunFolder]) -> None:
+def _announce(config: Config, folders: list[RunFolder], num_devices: int) -> None:
     device = jax.devices()[0]
-    where = f"{jax.device_count()} × {device.device_kind}" if device.platform != "cpu" else "the CPU"
+    where = device.device_kind if device.platform != "cpu" else "the CPU"
+    where = where if num_devices == 1 else f"{num_devices} × {where}, a process each"
     path = folders[0].path if len(folders) == 1 else f"{len(folders)} folders of {folders[0].path.parent}"
     print(f"Training {config.env.name} with {config.algo.name} on {where}, physics={config.physics}, in {path}")
     if config.hardware == "cpu":

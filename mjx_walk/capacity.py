@@ -57,7 +57,7 @@ def num_bytes(make: Callable[..., Any], *args: Any) -> int:
 
 def device_memory() -> int:
     """Bytes that JAX may allocate on its first device."""
-    stats = jax.devices()[0].memory_stats()
+    stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:
         return stats["bytes_limit"]
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -22,6 +22,8 @@ FORMAT = 1
 
 _META = "meta.json"
 _ARRAYS = "arrays"
+_NUMPY = "arrays.npz"
+"""What processes but the first write, into the same folders."""
 _REPLAY = "replay"
 """The TrainState's field that is kept in the newest checkpoint only, in a part of its own."""
 
@@ -90,6 +92,9 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
             warnings.warn(f"{path} has no replay any more; it is filled again before learning goes on", stacklevel=2)
             arrays |= {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in wanted.items() if _is_replay(name)}
             meta["crc32"] = {name: crc for name, crc in meta["crc32"].items() if not _is_replay(name)}
+    for name, leaf in wanted.items():
+        if name in arrays and arrays[name].dtype.kind == "V":  # NumPy's files know no bfloat16
+            arrays[name] = arrays[name].view(leaf.dtype)
     for name, crc in meta["crc32"].items():
         if name not in arrays or _crc32(arrays[name]) != crc:
             raise ValueError(f"{path} is damaged: {name} does not match its checksum")
@@ -196,16 +201,34 @@ def _is_replay(name: str) -> bool:
 
 
 def _write(path: Path, arrays: HostArrays) -> None:
-    with ocp.PyTreeCheckpointer() as checkpointer:
+    if jax.process_index():  # Orbax writes arrays of the host from the first process alone
+        path.mkdir()
+        np.savez(path / _NUMPY, allow_pickle=False, **arrays)
+        return
+    with _checkpointer() as checkpointer:
         checkpointer.save(path.absolute(), arrays)
 
 
 def _read(path: Path) -> HostArrays:
     try:
-        with ocp.PyTreeCheckpointer() as checkpointer:
+        if (path / _NUMPY).exists():
+            with np.load(path / _NUMPY) as arrays:
+                return dict(arrays)
+        with _checkpointer() as checkpointer:
             return checkpointer.restore(path.absolute())
     except Exception as error:  # Orbax reports damage through many types
         raise ValueError(f"{path} is damaged: {str(error).splitlines()[0][:200]}") from error
+
+
+def _checkpointer() -> ocp.Checkpointer:
+    """Orbax's, which by default would wait for all processes of a team; each writes and reads for itself."""
+    options = ocp.options.MultiprocessingOptions()
+    is_team = jax.process_count() > 1
+    if is_team:
+        rank = jax.process_index()
+        options = ocp.options.MultiprocessingOptions(rank, {rank}, f"process_{rank}")
+    handler = ocp.PyTreeCheckpointHandler(use_ocdbt=not is_team, multiprocessing_options=options)
+    return ocp.Checkpointer(handler, multiprocessing_options=options)
 
 
 def _crc32(array: np.ndarray) -> int:

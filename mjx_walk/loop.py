@@ -1,6 +1,7 @@
 """The only host loop: run a chunk on the device, log it, evaluate, save."""
 
 import collections
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -15,8 +16,9 @@ from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.interrupt import Interrupt
 from mjx_walk.metrics import Progress, Row, name_metrics
-from mjx_walk.recorder import Recorder
+from mjx_walk.recorder import Follower, Recorder
 from mjx_walk.run_folder import RunFolder
+from mjx_walk.team import Team, per_device
 from mjx_walk.types import Algorithm, Metrics, TrainState
 
 Chunk = Callable[[TrainState], tuple[TrainState, Metrics]]
@@ -83,6 +85,7 @@ class Trainer:
         task: Task,
         folders: list[RunFolder],
         on_metrics: Callable[[Row], None] | None = None,
+        team: Team | None = None,
     ):
         """
         Args:
@@ -90,16 +93,27 @@ class Trainer:
             task: the unbatched environment.
             folders: prepared run folders, one for each.
             on_metrics: called with every row that is logged.
+            team: the processes that train a run together, each with `num_envs` copies.
         """
         self.config = config = configs[0]
         self._task = task
-        alone = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
-        self.recorders = [Recorder(own, task, alone, folder) for own, folder in zip(configs, folders, strict=True)]
+        self._team = team
+        settings = per_device(config.algo, team.size) if team else config.algo
+        alone = make_algorithm(task, config.num_envs, config.evaluation, settings)
+        self._steps_per_update = alone.steps_per_update * (team.size if team else 1)
+        make_recorder = Follower if team and team.rank else Recorder
+        self.recorders = [
+            make_recorder(own, task, alone, folder, team) for own, folder in zip(configs, folders, strict=True)
+        ]
         self.algorithm = over_seeds(alone) if len(configs) > 1 else alone
-        self.steps_per_chunk = alone.steps_per_update * config.updates_per_chunk
+        self.steps_per_chunk = self._steps_per_update * config.updates_per_chunk
         self.num_chunks = -(-config.total_steps // self.steps_per_chunk)
-        self._chunk = make_chunk(self.algorithm, config.updates_per_chunk, fused=task.engine.name != "c")
-        self._are_sound = jax.jit(self._has_finite_policy if len(configs) == 1 else jax.vmap(self._has_finite_policy))
+        if team:
+            self._chunk = team.make_chunk(alone, config.updates_per_chunk, task.reward_terms)
+        else:
+            self._chunk = make_chunk(self.algorithm, config.updates_per_chunk, fused=task.engine.name != "c")
+        self._has_axis = team is not None or len(configs) > 1  # in front of every array
+        self._are_sound = jax.jit(jax.vmap(self._has_finite_policy) if self._has_axis else self._has_finite_policy)
         self._on_metrics = on_metrics or (lambda row: None)
         self._started = time.monotonic()
         self._times: collections.deque[tuple[float, int]] = collections.deque()
@@ -133,10 +147,11 @@ class Trainer:
                 recorder.write(row)
                 self._warn_of_overflow(row)
                 self._on_metrics(row)
-            progress.update(_mean_row(rows))
+            if not self._team or self._team.rank == 0:
+                progress.update(_mean_row(rows))
 
         with Interrupt() as interrupt:
-            while chunk < self.num_chunks and not interrupt.signal_name and not diverged:
+            while chunk < self.num_chunks and not self._stop_signal(interrupt) and not diverged:
                 state, metrics = self._chunk(state)
                 if pending:  # fetched while the next chunk runs
                     log(*pending)
@@ -147,6 +162,7 @@ class Trainer:
                     saved_chunk = chunk
             if pending:
                 log(*pending)
+            signal_name = self._stop_signal(interrupt)
             if saved_chunk != chunk:
                 self._save(state, chunk)
         progress.close()
@@ -154,7 +170,7 @@ class Trainer:
             state = state.replace(replay=())  # saved, and not looked at again
         for recorder, own in zip(self.recorders, self._split(state), strict=True):
             recorder.end(own, chunk * self.steps_per_chunk)
-            if interrupt.signal_name or diverged:
+            if signal_name or diverged:
                 recorder.wait()
         if diverged:
             raise UserError(
@@ -162,7 +178,7 @@ class Trainer:
                 f"{', '.join(map(str, sorted(diverged)))} is not finite any more; checkpoints from before are kept; "
                 "lower the learning rate, or clip gradients"
             )
-        return interrupt.signal_name
+        return signal_name
 
     def score(self) -> None:
         """Score every run in the real Gymnasium; see `Recorder.score`."""
@@ -177,30 +193,30 @@ class Trainer:
     def _start(self) -> tuple[TrainState, int]:
         """The TrainState to begin with, and the number of chunks behind it."""
         keys = [jax.random.PRNGKey(recorder.config.seed) for recorder in self.recorders]
-        init = make_init(self.algorithm)
+        init = self._team.make_init(self.algorithm) if self._team else make_init(self.algorithm)
         key = keys[0] if len(keys) == 1 else jnp.stack(keys)
         if not self.config.resume:
             return init(key), 0
         like = jax.eval_shape(init, key)
-        if len(keys) > 1:
+        if self._has_axis:
             like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), like)
         states, facts = [], []
         for recorder in self.recorders:
             state, fact = recorder.restore(like)
             facts.append(fact)
             # Through the host, where there is room for all of them twice.
-            states.append(state if len(keys) == 1 else jax.device_get(state))
+            states.append(jax.device_get(state) if self._has_axis else state)
         steps = {fact["env_steps"] for fact in facts}
         if len(steps) > 1:
             at = ", ".join(f"{step:,}" for step in sorted(steps))
             raise UserError(f"the seeds stand at different steps ({at}); resume each alone")
         self._seconds_before = max(fact["wall_seconds"] for fact in facts)
-        state = states[0] if len(states) == 1 else jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *states)
+        state = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *states) if self._has_axis else states[0]
         return state, steps.pop() // self.steps_per_chunk
 
     def _split(self, state: TrainState) -> list[TrainState]:
-        """The TrainState of each run; of several, on the host, where a replay more takes nothing from training."""
-        if len(self.recorders) == 1:
+        """The TrainState of each run, without an axis in front; if there was one, on the host, where there is room."""
+        if not self._has_axis:
             return [state]
         state = jax.device_get(state)
         return [jax.tree.map(lambda x, i=i: x[i], state) for i in range(len(self.recorders))]
@@ -215,7 +231,7 @@ class Trainer:
         rows = []
         for i in range(len(self.recorders)):
             own = metrics if len(self.recorders) == 1 else {name: value[:, i] for name, value in metrics.items()}
-            rows.append(common | name_metrics(own, self._task.reward_terms, self.algorithm.steps_per_update) | speed)
+            rows.append(common | name_metrics(own, self._task.reward_terms, self._steps_per_update) | speed)
         return rows
 
     def _warn_of_overflow(self, row: Row) -> None:
@@ -246,6 +262,14 @@ class Trainer:
         for recorder, own, is_sound in zip(self.recorders, self._split(state), are_sound, strict=True):
             if is_sound:
                 recorder.save(own, chunk * self.steps_per_chunk, self._seconds())
+
+    def _stop_signal(self, interrupt: Interrupt) -> str | None:
+        """The name of the signal that asks to stop, whichever of the processes it has reached."""
+        if not self._team:
+            return interrupt.signal_name
+        number = signal.Signals[interrupt.signal_name].value if interrupt.signal_name else 0
+        number = max(self._team.gather(number))
+        return signal.Signals(number).name if number else None
 
     def _has_finite_policy(self, state: TrainState) -> jax.Array:
         leaves = jax.tree.leaves(self.algorithm.policy_params(state))

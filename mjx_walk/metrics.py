@@ -20,6 +20,11 @@ _SECONDS_BETWEEN_LINES = 10.0
 """Where there is no terminal, progress is a plain line this often."""
 
 
+def is_sum(name: str, reward_terms: tuple[str, ...]) -> bool:
+    """Whether a metric of an update is a sum over the copies."""
+    return name in ("episodes", "return", "length", *_SUMS, *reward_terms)
+
+
 def name_metrics(metrics: Metrics, reward_terms: tuple[str, ...], steps_per_update: int) -> Row:
     """Turn the metrics of one chunk into a log row.
 

@@ -14,6 +14,7 @@ from brax.training.agents.sac import networks as sac_networks
 from brax.training.distribution import NormalDistribution, NormalTanhDistribution
 from brax.training.networks import ACTIVATION
 
+from mjx_walk import collectives
 from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 
@@ -158,8 +159,10 @@ def init_normalizer(observation_size: int) -> running_statistics.RunningStatisti
 def update_normalizer(
     normalizer: running_statistics.RunningStatisticsState, obs: jax.Array
 ) -> running_statistics.RunningStatisticsState:
-    """Take `[…, observation_size]` observations into the running statistics."""
-    return running_statistics.update(normalizer, obs, std_min_value=MIN_OBSERVATION_STD)
+    """Take `[…, observation_size]` observations, of all devices, into the running statistics."""
+    return running_statistics.update(
+        normalizer, obs, std_min_value=MIN_OBSERVATION_STD, pmap_axis_name=collectives.axis()
+    )
 
 
 def to_env_action(task: Task, action: jax.Array) -> jax.Array:

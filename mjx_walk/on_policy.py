@@ -14,7 +14,7 @@ from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as brax_ppo_networks
 from brax.training.networks import ACTIVATION
 
-from mjx_walk import networks, returns, rollout
+from mjx_walk import collectives, networks, returns, rollout
 from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
@@ -96,6 +96,10 @@ class OnPolicyBatch(flax.struct.PyTreeNode):
     transitions: Transition
     """`[N, T, …]`. What Brax's PPO loss does not read is left out: `action` is empty (the raw action is in `extras`),
     and `next_observation` holds the last step's only, `[N, 1, …]`."""
+    rewards: jax.Array
+    """`[T·U, B]`, as the environment gave them, in their order; U pieces of each copy."""
+    ended: jax.Array
+    """`[T·U, B] bool`: an episode ended at this step."""
     reward_scale: jax.Array
     stats: Metrics
 
@@ -224,11 +228,14 @@ def make_on_policy(
         # Where an episode ended at a piece's last step, last_obs belongs to the next one: its discount is 0.
         transitions = jax.tree.map(_pieces_first, transitions)
         transitions = transitions._replace(next_observation=last_obs.reshape((-1, 1, last_obs.shape[-1])))
-        return_scale = returns.update_return_scale(
-            state.return_scale, reward.reshape((-1, num_envs)), done.reshape((-1, num_envs)), config.discount
+        batch = OnPolicyBatch(
+            transitions=transitions,
+            rewards=reward.reshape((-1, num_envs)),
+            ended=done.reshape((-1, num_envs)),
+            reward_scale=reward_scale,
+            stats=jax.tree.map(lambda x: x.sum(0), stats) | scores,
         )
-        batch = OnPolicyBatch(transitions, reward_scale, jax.tree.map(lambda x: x.sum(0), stats) | scores)
-        return state.replace(env=env_state, noise=noise, return_scale=return_scale, key=key), batch
+        return state.replace(env=env_state, noise=noise, key=key), batch
 
     def remaining(state: OnPolicyState) -> jax.Array:
         return anneal(state.updates * float(steps_per_update), config.schedule_steps)
@@ -245,6 +252,7 @@ def learning_rates(config: OnPolicyConfig, state: OnPolicyState, remaining: jax.
 def after_update(
     config: OnPolicyConfig,
     state: OnPolicyState,
+    batch: OnPolicyBatch,
     params: ppo_losses.PPONetworkParams,
     optimizer: optax.OptState,
     normalizer: RunningStatisticsState,
@@ -254,12 +262,13 @@ def after_update(
     """`state` with what an update has changed, and a learning rate that follows the KL it ended at if it is to."""
     rate = state.learning_rate
     if config.learning_rate_schedule == "adaptive_kl":
-        rate = adapt_rate(rate, kl, config.target_kl)
+        rate = adapt_rate(rate, collectives.mean(kl), config.target_kl)
     return state.replace(
         params=params,
         optimizer=optimizer,
         learning_rate=rate,
         normalizer=normalizer,
+        return_scale=returns.update_return_scale(state.return_scale, batch.rewards, batch.ended, config.discount),
         key=key,
         updates=state.updates + 1,
     )

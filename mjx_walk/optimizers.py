@@ -5,6 +5,8 @@ from typing import Any
 import jax
 import optax
 
+from mjx_walk import collectives
+
 
 def make_adam(max_grad_norm: float | None = None) -> optax.GradientTransformation:
     """Adam without its learning rate, which `descend` multiplies in, after clipping by the global norm if asked."""
@@ -16,11 +18,11 @@ def make_adam(max_grad_norm: float | None = None) -> optax.GradientTransformatio
 def descend(
     optimizer: optax.GradientTransformation, params: Any, grads: Any, state: optax.OptState, rate: Any
 ) -> tuple[Any, optax.OptState]:
-    """One step down the gradient: `(params, optimizer state)` after it.
+    """One step down the gradient, its mean over the devices: `(params, optimizer state)` after it.
 
     `rate` is one for all parameters, or a tree of them whose leaves stand for subtrees of `params`.
     """
-    updates, state = optimizer.update(grads, state)
+    updates, state = optimizer.update(collectives.mean(grads), state)
     steps = jax.tree.map(lambda rate, part: jax.tree.map(lambda u: -rate * u, part), rate, updates)
     return optax.apply_updates(params, steps), state
 

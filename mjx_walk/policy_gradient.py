@@ -125,7 +125,7 @@ def learn_once(
     keys = jax.random.split(loss_key, config.num_minibatches)
     (params, optimizer), metrics = jax.lax.scan(minibatch, (state.params, state.optimizer), (rows, keys))
     normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
-    new_state = after_update(config, state, params, optimizer, normalizer, metrics["kl"][-1], key)
+    new_state = after_update(config, state, batch, params, optimizer, normalizer, metrics["kl"][-1], key)
     return new_state, batch.stats | jax.tree.map(jnp.mean, metrics) | {
         "learning_rate": jnp.float32(rates.policy),
         "reward_scale": batch.reward_scale,

@@ -1,6 +1,7 @@
 """What a run leaves in its folder while it trains: its rows, its checkpoints, its best policy, its scores."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 from mjx_walk import checkpoint, plots
@@ -10,28 +11,37 @@ from mjx_walk.evaluation import Scores, score_in_gymnasium
 from mjx_walk.metrics import MetricsWriter, Row
 from mjx_walk.policies import deterministic_act
 from mjx_walk.run_folder import RunFolder
+from mjx_walk.team import Team
+from mjx_walk.team_checkpoint import NUM_DEVICES, device_folder, restore_newest
 from mjx_walk.types import Algorithm, TrainState
 
 
 class Recorder:
     """The disk's side of one run."""
 
-    def __init__(self, config: Config, task: Task, algorithm: Algorithm, folder: RunFolder):
+    def __init__(self, config: Config, task: Task, algorithm: Algorithm, folder: RunFolder, team: Team | None = None):
         """
         Args:
             config: checked configuration.
             task: the unbatched environment.
-            algorithm: of this run alone.
+            algorithm: of this run alone, on one device.
             folder: prepared run folder.
+            team: the processes that train the run together.
         """
         self.config = config
         self._task = task
         self._algorithm = algorithm
         self._folder = folder
-        self._saver = checkpoint.BackgroundSaver(folder.checkpoints, config.checkpoint.keep)
+        self._team = team
+        self._num_devices = team.size if team else 1
+        self._saver = checkpoint.BackgroundSaver(self._checkpoints, config.checkpoint.keep)
         self._best_update = -1
         self._writer: MetricsWriter | None = None
         self._policies: list[tuple[Any, dict[str, Any]]] = []
+
+    @property
+    def _checkpoints(self) -> Path:
+        return self._folder.checkpoints
 
     def restore(self, like: TrainState) -> tuple[TrainState, dict[str, Any]]:
         """The newest TrainState saved, and its `env_steps` and `wall_seconds`.
@@ -39,7 +49,7 @@ class Recorder:
         Args:
             like: shapes of a TrainState.
         """
-        state, facts = checkpoint.restore_newest(self._folder.checkpoints, like)
+        state, facts = restore_newest(self._folder.checkpoints, like, self._team)
         if self._best_policy(state):
             self._best_update = int(state.env.live.best_update)
         return state, facts
@@ -58,8 +68,8 @@ class Recorder:
     def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:
         """Begin to save the whole state; and the best policy, if it is a new one. Before the first evaluation is over,
         the best policy is the present one."""
-        facts = {"env_steps": env_steps, "wall_seconds": wall_seconds}
-        parts = [(checkpoint.step_path(self._folder.checkpoints, env_steps), state, facts)]
+        facts = {"env_steps": env_steps, "wall_seconds": wall_seconds, NUM_DEVICES: self._num_devices}
+        parts = [(checkpoint.step_path(self._checkpoints, env_steps), state, facts)]
         best = self._best_policy(state)
         if not best:
             parts.append((self._folder.best_policy, self._algorithm.policy_params(state), {"env_steps": env_steps}))
@@ -110,5 +120,32 @@ class Recorder:
         live = state.env.live
         if math.isinf(live.best_return):
             return None
-        env_steps = int(live.best_update) * self._algorithm.steps_per_update
+        env_steps = int(live.best_update) * self._algorithm.steps_per_update * self._num_devices
         return live.best_policy_params, {"env_steps": env_steps, "eval_return": float(live.best_return)}
+
+
+class Follower(Recorder):
+    """Of a team's other processes, which only keep what is their device's own."""
+
+    @property
+    def _checkpoints(self) -> Path:
+        assert self._team
+        return device_folder(self._folder.checkpoints, self._team.rank)
+
+    def begin(self, env_steps: int, trains_on: bool) -> None:
+        """Nothing: the first process logs."""
+
+    def write(self, row: Row) -> None:
+        """Nothing."""
+
+    def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:
+        """Begin to save the whole state."""
+        facts = {"env_steps": env_steps, "wall_seconds": wall_seconds}
+        self._saver.save((checkpoint.step_path(self._checkpoints, env_steps), state, facts))
+
+    def end(self, state: TrainState, env_steps: int) -> None:
+        """Nothing."""
+
+    def score(self, wall_seconds: float) -> Scores | None:
+        """Nothing: the first process's policy is everyone's."""
+        return None

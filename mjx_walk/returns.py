@@ -4,6 +4,8 @@ import flax
 import jax
 import jax.numpy as jnp
 
+from mjx_walk import collectives
+
 
 def bootstrap_truncated(
     reward: jax.Array, truncated: jax.Array, next_value: jax.Array, discount: float, reward_scale: jax.Array | float
@@ -89,7 +91,7 @@ def init_return_scale(num_envs: int) -> ReturnScale:
 
 
 def update_return_scale(scale: ReturnScale, reward: jax.Array, done: jax.Array, discount: float) -> ReturnScale:
-    """Take a chronological `[T, B]` block of rewards into the running variance."""
+    """Take a chronological `[T, B]` block of rewards, on each device its own, into the running variance."""
 
     def advance(running, inputs):
         reward, done = inputs
@@ -97,11 +99,13 @@ def update_return_scale(scale: ReturnScale, reward: jax.Array, done: jax.Array, 
         return jnp.where(done, 0.0, running), running
 
     running, returns = jax.lax.scan(advance, scale.running_return, (reward, done))
-    batch_count = jnp.float32(returns.size)
+    batch_count = collectives.total(jnp.float32(returns.size))
+    batch_mean = collectives.mean(returns.mean())
+    batch_variance = collectives.mean(jnp.square(returns - batch_mean).mean())
     count = scale.count + batch_count
-    delta = returns.mean() - scale.mean
+    delta = batch_mean - scale.mean
     mean = scale.mean + delta * batch_count / count
-    squares = scale.variance * scale.count + returns.var() * batch_count
+    squares = scale.variance * scale.count + batch_variance * batch_count
     variance = (squares + delta**2 * scale.count * batch_count / count) / count
     return ReturnScale(running, count, mean, variance)
 

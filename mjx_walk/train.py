@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import sys
+import traceback
 from typing import Any
 
 import hydra
@@ -10,16 +11,19 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, open_dict
 
-from mjx_walk import cli
+from mjx_walk import cli, launch
 from mjx_walk.api import resolve, resolve_seeds, train
 from mjx_walk.config import CONFIG_DIR, complete_overrides, load_config, register_schemas, to_config
+from mjx_walk.errors import UserError
 from mjx_walk.interrupt import exit_code
+from mjx_walk.team import Team, join
 
 USAGE = """
 usage: python -m mjx_walk.train [env=humanoid|humanoid_standup|walker2d] [algo=ppo] [KEY=VALUE ...]
 
   physics=auto|warp|jax|c   num_envs=N   total_steps=N   seed=N   run_dir=PATH   resume=true
   seeds=N or [3,7]                        several seeds side by side in one program, each in a folder of its own
+  devices=all or N                        one run on the GPUs of this host, or of a cluster: a process and num_envs each
   recipe=PATH_BELOW_configs/recipe        another recipe than the one for the environment and the hardware
   env.KEY=VALUE                           Gymnasium's keywords, and version=v4 as env.version=v4
   algo.KEY=VALUE                          the algorithm's settings
@@ -29,8 +33,11 @@ usage: python -m mjx_walk.train [env=humanoid|humanoid_standup|walker2d] [algo=p
 
 
 @dataclasses.dataclass
-class Seeds:
+class Own:
+    """Arguments that are no settings of a run."""
+
     seeds: Any = 1
+    devices: Any = None
 
 
 def main(arguments: list[str]) -> int:
@@ -41,13 +48,36 @@ def main(arguments: list[str]) -> int:
     if any(argument.startswith("-") for argument in arguments):
         _through_hydra(arguments)
         return 0
-    own = [argument for argument in arguments if argument.startswith("seeds=")]
-    if own:
-        seeds = cli.read_seeds(cli.parse(Seeds, own, USAGE).seeds)
-        configs = resolve_seeds([argument for argument in arguments if argument not in own], seeds)
-    else:
-        configs = [resolve(arguments)]
+    given = [argument for argument in arguments if argument.startswith(("seeds=", "devices="))]
+    settings = [argument for argument in arguments if argument not in given]
+    own = cli.parse(Own, given, USAGE)
+    has_seeds = any(argument.startswith("seeds=") for argument in given)
+    if has_seeds and own.devices is not None:
+        raise UserError("give seeds=… or devices=…, not both")
+    team = join() if own.devices is not None else None
+    if own.devices is not None and not team:
+        size = launch.count(own.devices)
+        if size > 1:
+            resolve(settings)  # says once what is wrong in them
+            return launch.run(arguments, size)
+    if team:
+        return _train_in_team(settings, team)
+    configs = resolve_seeds(settings, cli.read_seeds(own.seeds)) if has_seeds else [resolve(settings)]
     _, signal_name = train(configs)
+    return exit_code(signal_name) if signal_name else 0
+
+
+def _train_in_team(settings: list[str], team: Team) -> int:
+    """As one process of several. Where it fails it leaves at once, since JAX would wait for those that wait for it."""
+    try:
+        _, signal_name = train([resolve(settings)], team=team)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        os._exit(2)
+    except BaseException:
+        traceback.print_exc()
+        sys.stderr.flush()
+        os._exit(1)
     return exit_code(signal_name) if signal_name else 0
 
 

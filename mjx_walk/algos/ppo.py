@@ -92,7 +92,7 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
         carry = (state.params, state.optimizer, update_key)
         (params, optimizer, _), metrics = jax.lax.scan(epoch, carry, length=config.num_epochs)
         kl = metrics["kl_mean"][-1, -1]
-        new_state = after_update(config, state, params, optimizer, new_normalizer, kl, key)
+        new_state = after_update(config, state, batch, params, optimizer, new_normalizer, kl, key)
         acted_with = batch.transitions.extras["policy_extras"]["distribution_params"]
         # The entropy is only told, so it may borrow the next update's key.
         return new_state, batch.stats | _loss_metrics(metrics) | {

@@ -1,0 +1,150 @@
+"""Several devices that learn together: their means in one process, and two processes from the command to the score."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import ENVIRONMENT, TINY, TINY_CHUNK, TINY_OFF_POLICY, command
+from toy_tasks import ObservedReward
+
+from mjx_walk import checkpoint, networks, returns
+from mjx_walk.algos.ppo import PPOConfig, make_ppo
+from mjx_walk.collectives import AXIS
+from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.team import OWN
+
+KEY = jax.random.PRNGKey(0)
+CHUNK = 2 * TINY_CHUNK
+"""Environment steps of a chunk on two devices."""
+
+
+def halves(tree):
+    """The first axis in two."""
+    return jax.tree.map(lambda x: x.reshape((2, -1, *x.shape[1:])), tree)
+
+
+def twice(tree):
+    return jax.tree.map(lambda x: jnp.stack([x, x]), tree)
+
+
+def assert_close(tree, other):
+    for one, two in zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-5)
+
+
+def test_two_devices_learn_what_one_learns_from_both_batches():
+    settings = {"num_unrolls": 1, "num_minibatches": 1, "num_epochs": 3, "entropy_cost": 0.0}
+    config = PPOConfig(unroll_length=4, normalize_advantages=False, normalize_rewards=True, **settings)
+    algorithm = make_ppo(ObservedReward(), 16, EvaluationConfig(1), config)
+    state, batch = jax.jit(algorithm.collect)(algorithm.init(KEY))
+    alone, _ = jax.jit(algorithm.learn)(state, batch)
+    by_copy = lambda x: jnp.stack(jnp.split(x, 2, axis=1))  # noqa: E731
+    parts = twice(batch).replace(
+        transitions=halves(batch.transitions), rewards=by_copy(batch.rewards), ended=by_copy(batch.ended)
+    )
+    scale = twice(state.return_scale).replace(running_return=halves(state.return_scale.running_return))
+    together, _ = jax.jit(jax.vmap(algorithm.learn, axis_name=AXIS))(twice(state).replace(return_scale=scale), parts)
+    for name in ("params", "optimizer", "normalizer"):
+        both = getattr(together, name)
+        assert_close(jax.tree.map(lambda x: x[0], both), jax.tree.map(lambda x: x[1], both))
+        assert_close(jax.tree.map(lambda x: x[0], both), getattr(alone, name))
+
+
+def test_running_statistics_are_of_all_devices():
+    obs, reward = jax.random.normal(KEY, (8, 5, 3)), jax.random.normal(KEY, (20, 8))
+    ended = reward > 1.0
+    normalizer = networks.init_normalizer(3)
+    alone = networks.update_normalizer(normalizer, obs)
+    together = jax.vmap(networks.update_normalizer, axis_name=AXIS)(twice(normalizer), halves(obs))
+    assert_close(jax.tree.map(lambda x: x[1], together), alone)
+    update = lambda scale, reward, ended: returns.update_return_scale(scale, reward, ended, 0.9)  # noqa: E731
+    whole = update(returns.init_return_scale(8), reward, ended)
+    split = lambda x: jnp.stack(jnp.split(x, 2, axis=1))  # noqa: E731
+    parts = jax.vmap(update, axis_name=AXIS)(twice(returns.init_return_scale(4)), split(reward), split(ended))
+    for name in ("count", "mean", "variance"):
+        np.testing.assert_allclose(getattr(parts, name)[0], getattr(whole, name), rtol=1e-4)
+
+
+def run(run_dir, *arguments, tiny=TINY, devices=2):
+    done = command("train", *tiny, f"run_dir={run_dir}", f"devices={devices}", "checkpoint.every_chunks=1", *arguments)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done
+
+
+def rows(run_dir):
+    return [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
+
+
+def newest(run_dir):
+    """The leaves of both devices' newest checkpoints."""
+    found = []
+    for folder in (run_dir / "checkpoints", run_dir / "checkpoints" / "device_1"):
+        path = checkpoint.list_steps(folder)[-1]
+        parts = [checkpoint._read(part) for part in (path / "arrays", path / "replay") if part.exists()]
+        found.append({name: leaf for part in parts for name, leaf in part.items()})
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tiny", [TINY, (*TINY_OFF_POLICY, "algo=sac")])
+def test_two_processes_learn_the_same_and_resume_exactly(tmp_path, tiny):
+    scored = run(tmp_path / "whole", f"total_steps={4 * CHUNK}", "evaluation.gymnasium_episodes=1", tiny=tiny)
+    assert "2 ×" in scored.stdout and "In the real Gymnasium" in scored.stdout
+    first, second = newest(tmp_path / "whole")
+    for name, leaf in first.items():
+        is_own = name.split(".")[0] in OWN or name == "return_scale.running_return"
+        assert is_own or np.array_equal(leaf, second[name]), name
+    assert not np.array_equal(first["env.env.obs"], second["env.env.obs"])
+    assert [row["env_steps"] for row in rows(tmp_path / "whole")] == [CHUNK, 2 * CHUNK, 3 * CHUNK, 4 * CHUNK]
+    run(tmp_path / "parted", f"total_steps={2 * CHUNK}", tiny=tiny)
+    run(tmp_path / "parted", f"total_steps={4 * CHUNK}", "resume=true", tiny=tiny)
+    for one, two in zip(newest(tmp_path / "whole"), newest(tmp_path / "parted"), strict=True):
+        for name, leaf in one.items():
+            np.testing.assert_array_equal(leaf, two[name], err_msg=name)
+    for devices in (1, 3):
+        run(tmp_path / "parted", f"total_steps={(4 + 2 * devices) * CHUNK}", "resume=true", tiny=tiny, devices=devices)
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_ends_the_run_which_goes_on_from_its_checkpoint(tmp_path):
+    settings = [f"run_dir={tmp_path}/run", "devices=2"]
+    arguments = [*TINY, *settings, "checkpoint.every_chunks=1", f"total_steps={60 * CHUNK}"]
+    parent = subprocess.Popen(
+        [sys.executable, "-m", "mjx_walk.train", *arguments], env=ENVIRONMENT, stderr=subprocess.PIPE, text=True
+    )
+    second = tmp_path / "run" / "checkpoints" / "device_1"
+    deadline = time.monotonic() + 300
+    while time.monotonic() < deadline and len(list(second.glob("0*"))) < 2:
+        time.sleep(0.1)
+    children = subprocess.run(["pgrep", "-P", str(parent.pid)], capture_output=True, text=True, check=True)
+    os.kill(int(children.stdout.split()[-1]), signal.SIGKILL)
+    _, errors = parent.communicate(timeout=120)
+    assert parent.returncode == 1 and "the process of device 1 died; what was saved is whole" in errors
+    assert not (tmp_path / "run" / "eval_gymnasium.json").exists()
+    done = command("train", *settings, "resume=true")
+    assert done.returncode == 0, done.stderr
+    assert rows(tmp_path / "run")[-1]["env_steps"] == 60 * CHUNK
+
+
+@pytest.mark.slow
+def test_a_signal_stops_all_devices_at_the_same_step(tmp_path):
+    settings = [*TINY, f"run_dir={tmp_path}/run", "devices=2", "total_steps=100000000"]
+    parent = subprocess.Popen(
+        [sys.executable, "-m", "mjx_walk.train", *settings], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 300
+    while time.monotonic() < deadline and not list(tmp_path.glob("run/checkpoints/0*")):
+        time.sleep(0.1)
+    parent.send_signal(signal.SIGTERM)
+    out, _ = parent.communicate(timeout=120)
+    assert parent.returncode == 128 + signal.SIGTERM and "Stopped by SIGTERM and saved" in out
+    checkpoints = tmp_path / "run" / "checkpoints"
+    newest = [sorted(path.name for path in folder.glob("0*"))[-1] for folder in (checkpoints, checkpoints / "device_1")]
+    assert newest[0] == newest[1]
