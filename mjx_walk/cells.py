@@ -158,8 +158,7 @@ def start(job: list[Cell], log: Path, device: int | None, share: int, lock: int)
             shutil.rmtree(cell.folder.path)  # it was ended before it had saved anything
     env = dict(os.environ)
     if device is not None:
-        visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
-        env["CUDA_VISIBLE_DEVICES"] = visible[device] if visible else str(device)
+        env |= only_device(device)
     if share > 1:
         env.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{_MEMORY_FRACTION / share:.2f}")
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -259,6 +258,12 @@ def count_devices() -> tuple[str, int]:
         raise UserError(f"JAX does not start: {done.stderr.strip().splitlines()[-1]}")
     is_gpu, count = done.stdout.split()[-2:]
     return ("gpu", int(count)) if is_gpu == "True" else ("cpu", 1)
+
+
+def only_device(device: int) -> dict[str, str]:
+    """The environment variable that lets a process see one of the GPUs that this one sees."""
+    visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
+    return {"CUDA_VISIBLE_DEVICES": visible[device] if visible else str(device)}
 
 
 def _check_same_configuration(cell: Cell) -> None:

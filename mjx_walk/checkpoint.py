@@ -5,6 +5,7 @@ import os
 import shutil
 import warnings
 import zlib
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -131,19 +132,33 @@ def step_path(folder: Path, env_steps: int) -> Path:
     return folder / f"{env_steps:013d}"
 
 
-def restore_newest(folder: Path, like: Any) -> tuple[Any, dict[str, Any]]:
+def restore_newest(
+    folder: Path,
+    like: Any,
+    part: Callable[[Path], Path] = lambda path: path,
+    agree: Callable[[bool], bool] = lambda is_whole: is_whole,
+) -> tuple[Any, dict[str, Any]]:
     """The newest checkpoint that is whole; a damaged one is passed over with a warning.
+
+    Args:
+        folder: of the checkpoints.
+        like: as for `restore`.
+        part: what to read of the checkpoint at a path; ValueError where that cannot be told.
+        agree: whether to take it, asked once for each that is tried, with whether that part is whole.
 
     Raises:
         UserError: there is none, or it belongs to another run.
     """
     for path in reversed(list_steps(folder)):
+        found = None
         try:
-            return restore(path, like)
+            found = restore(part(path), like)
         except UserError:
             raise
         except ValueError as error:
             warnings.warn(f"{error}; falling back to the checkpoint before it", stacklevel=2)
+        if agree(found is not None) and found:
+            return found
     raise UserError(f"no usable checkpoint in {folder}; nothing to resume")
 
 
@@ -223,11 +238,10 @@ def _read(path: Path) -> HostArrays:
 def _checkpointer() -> ocp.Checkpointer:
     """Orbax's, which by default would wait for all processes of a team; each writes and reads for itself."""
     options = ocp.options.MultiprocessingOptions()
-    is_team = jax.process_count() > 1
-    if is_team:
+    if jax.process_count() > 1:
         rank = jax.process_index()
         options = ocp.options.MultiprocessingOptions(rank, {rank}, f"process_{rank}")
-    handler = ocp.PyTreeCheckpointHandler(use_ocdbt=not is_team, multiprocessing_options=options)
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=options)
     return ocp.Checkpointer(handler, multiprocessing_options=options)
 
 

@@ -9,7 +9,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from mjx_walk.cells import count_devices
+from mjx_walk.cells import count_devices, only_device
 from mjx_walk.errors import UserError
 from mjx_walk.interrupt import Interrupt, exit_code
 
@@ -70,11 +70,9 @@ def _start(arguments: list[str], size: int, logs: Path) -> list[subprocess.Popen
     with socket.socket() as free:
         free.bind(("localhost", 0))
         coordinator = f"localhost:{free.getsockname()[1]}"
-    visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
     processes = []
     for rank in range(size):
-        device = visible[rank] if visible else str(rank)
-        env = os.environ | {"MJX_WALK_TEAM": f"{rank},{size},{coordinator}", "CUDA_VISIBLE_DEVICES": device}
+        env = os.environ | {"MJX_WALK_TEAM": f"{rank},{size},{coordinator}"} | only_device(rank)
         with _log(logs, rank).open("w") as log:
             output = log if rank else None
             processes.append(

@@ -105,12 +105,13 @@ class Trainer:
         self.recorders = [
             make_recorder(own, task, alone, folder, team) for own, folder in zip(configs, folders, strict=True)
         ]
-        self.algorithm = over_seeds(alone) if len(configs) > 1 else alone
         self.steps_per_chunk = self._steps_per_update * config.updates_per_chunk
         self.num_chunks = -(-config.total_steps // self.steps_per_chunk)
         if team:
+            self.algorithm = team.beginning(alone)
             self._chunk = team.make_chunk(alone, config.updates_per_chunk, task.reward_terms)
         else:
+            self.algorithm = over_seeds(alone) if len(configs) > 1 else alone
             self._chunk = make_chunk(self.algorithm, config.updates_per_chunk, fused=task.engine.name != "c")
         self._has_axis = team is not None or len(configs) > 1  # in front of every array
         self._are_sound = jax.jit(jax.vmap(self._has_finite_policy) if self._has_axis else self._has_finite_policy)
@@ -193,7 +194,7 @@ class Trainer:
     def _start(self) -> tuple[TrainState, int]:
         """The TrainState to begin with, and the number of chunks behind it."""
         keys = [jax.random.PRNGKey(recorder.config.seed) for recorder in self.recorders]
-        init = self._team.make_init(self.algorithm) if self._team else make_init(self.algorithm)
+        init = make_init(self.algorithm)
         key = keys[0] if len(keys) == 1 else jnp.stack(keys)
         if not self.config.resume:
             return init(key), 0

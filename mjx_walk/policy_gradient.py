@@ -51,7 +51,7 @@ def check_minibatches(num_steps: int, config: PolicyGradientConfig) -> None:
 
 
 class Samples(NamedTuple):
-    """Steps of a batch that are learned from, `[S, …]`."""
+    """Steps of a batch that are learned from, `[T, N, …]` or `[N, T, …]`; of a minibatch, `[S, …]`."""
 
     observation: jax.Array
     raw_action: jax.Array
@@ -62,11 +62,6 @@ class Samples(NamedTuple):
     """0 for steps that do not count."""
     target: jax.Array | tuple[()]
     """For the value network; empty where there is none."""
-
-
-def flatten(samples: Samples) -> Samples:
-    """`[T, N, …]` or `[N, T, …]` to `[S, …]`."""
-    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), samples)
 
 
 def learn_once(
@@ -120,6 +115,7 @@ def learn_once(
         metrics |= {"loss": total, "grad_norm": optax.global_norm(grads)}
         return descend(ground.optimizer, params, grads, opt_state, rates), metrics
 
+    samples = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), samples)
     num_steps = samples.weight.size // config.num_minibatches * config.num_minibatches
     rows = jax.random.permutation(shuffle_key, samples.weight.size)[:num_steps].reshape((config.num_minibatches, -1))
     keys = jax.random.split(loss_key, config.num_minibatches)

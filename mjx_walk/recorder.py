@@ -68,8 +68,7 @@ class Recorder:
     def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:
         """Begin to save the whole state; and the best policy, if it is a new one. Before the first evaluation is over,
         the best policy is the present one."""
-        facts = {"env_steps": env_steps, "wall_seconds": wall_seconds, NUM_DEVICES: self._num_devices}
-        parts = [(checkpoint.step_path(self._checkpoints, env_steps), state, facts)]
+        parts = [self._whole(state, env_steps, wall_seconds)]
         best = self._best_policy(state)
         if not best:
             parts.append((self._folder.best_policy, self._algorithm.policy_params(state), {"env_steps": env_steps}))
@@ -77,6 +76,11 @@ class Recorder:
             self._best_update = int(state.env.live.best_update)
             parts.append((self._folder.best_policy, *best))
         self._saver.save(*parts)
+
+    def _whole(self, state: TrainState, env_steps: int, wall_seconds: float) -> tuple[Path, TrainState, dict[str, Any]]:
+        """A checkpoint, as `BackgroundSaver.save` takes it."""
+        facts = {"env_steps": env_steps, "wall_seconds": wall_seconds, NUM_DEVICES: self._num_devices}
+        return checkpoint.step_path(self._checkpoints, env_steps), state, facts
 
     def end(self, state: TrainState, env_steps: int) -> None:
         """Close the log, draw it, and remember the policies that may be scored."""
@@ -140,8 +144,7 @@ class Follower(Recorder):
 
     def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:
         """Begin to save the whole state."""
-        facts = {"env_steps": env_steps, "wall_seconds": wall_seconds}
-        self._saver.save((checkpoint.step_path(self._checkpoints, env_steps), state, facts))
+        self._saver.save(self._whole(state, env_steps, wall_seconds))
 
     def end(self, state: TrainState, env_steps: int) -> None:
         """Nothing."""

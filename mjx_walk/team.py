@@ -19,6 +19,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint import multihost
 
+from mjx_walk import collectives
 from mjx_walk.collectives import AXIS
 from mjx_walk.metrics import is_sum
 from mjx_walk.types import Algorithm, Metrics, TrainState
@@ -44,15 +45,14 @@ class Team:
         devices = sorted(jax.devices(), key=lambda device: device.process_index)
         return NamedSharding(Mesh(np.array(devices), (AXIS,)), PartitionSpec(AXIS))
 
-    def make_init(self, algorithm: Algorithm) -> Callable[[jax.Array], TrainState]:
-        """As `loop.make_init`; what is a device's own begins from a key of its own."""
+    def beginning(self, algorithm: Algorithm) -> Algorithm:
+        """One whose TrainState has an axis of one in front; what is a device's own begins from a key of its own."""
 
         def init(key):
             state, own = algorithm.init(key), algorithm.init(jax.random.fold_in(key, self.rank))
-            state = state.replace(**{name: getattr(own, name) for name in OWN if hasattr(state, name)})
-            return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x))[None], state)
+            return _expand(state.replace(**{name: getattr(own, name) for name in OWN if hasattr(state, name)}))
 
-        return jax.jit(init)
+        return algorithm._replace(init=init)
 
     def make_chunk(
         self, algorithm: Algorithm, num_updates: int, reward_terms: tuple[str, ...]
@@ -139,12 +139,12 @@ def _squeeze(tree: Any) -> Any:
 
 
 def _expand(tree: Any) -> Any:
-    return jax.tree.map(lambda x: x[None], tree)
+    return jax.tree.map(lambda x: jnp.asarray(x)[None], tree)
 
 
 def _over_devices(name: str, value: jax.Array, reward_terms: tuple[str, ...]) -> jax.Array:
     if is_sum(name, reward_terms):
-        return jax.lax.psum(value, AXIS)
+        return collectives.total(value)
     if name.startswith("eval_"):  # every device's round ends when it ends; the first one's are told
         return jax.lax.all_gather(value, AXIS)[0]
-    return jax.lax.pmean(value, AXIS)
+    return collectives.mean(value)

@@ -1,6 +1,5 @@
 """Checkpoints of a run on several devices: the first one's where a run on one has them, the others' beside it."""
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from mjx_walk import checkpoint
-from mjx_walk.errors import UserError
 from mjx_walk.team import Team
 from mjx_walk.types import TrainState
 
 NUM_DEVICES = "num_devices"
 """Beside a checkpoint: how many there were."""
+_KEYS = ("key", "noise_key")
 
 
 def device_folder(checkpoints: Path, rank: int) -> Path:
@@ -31,24 +30,20 @@ def restore_newest(checkpoints: Path, like: TrainState, team: Team | None) -> tu
         UserError: there is none, or it belongs to another run.
     """
     rank, size = (team.rank, team.size) if team else (0, 1)
-    for path in reversed(checkpoint.list_steps(checkpoints)):
-        found = None
-        try:
-            before = int(checkpoint.read_meta(path).get(NUM_DEVICES, 1))
-            found = checkpoint.restore(device_folder(checkpoints, rank % before) / path.name, like)
-        except ValueError as error:
-            warnings.warn(f"{error}; falling back to the checkpoint before it", stacklevel=2)
-        if (team and not all(team.gather(found is not None))) or found is None:
-            continue
-        state, facts = found
-        if rank >= before:
-            keys = {name: jax.random.fold_in(getattr(state, name), rank) for name in _KEYS if hasattr(state, name)}
-            state = state.replace(**keys)
-        return (_recount(state, before, size) if before != size else state), facts
-    raise UserError(f"no usable checkpoint in {checkpoints}; nothing to resume")
 
+    def part(path: Path) -> Path:
+        before = checkpoint.read_meta(path).get(NUM_DEVICES, 1)
+        return device_folder(checkpoints, rank % before) / path.name
 
-_KEYS = ("key", "noise_key")
+    def agree(is_whole: bool) -> bool:
+        return all(team.gather(is_whole)) if team else is_whole
+
+    state, facts = checkpoint.restore_newest(checkpoints, like, part, agree)
+    before = facts.get(NUM_DEVICES, 1)
+    if rank >= before:
+        keys = {name: jax.random.fold_in(getattr(state, name), rank) for name in _KEYS if hasattr(state, name)}
+        state = state.replace(**keys)
+    return (_recount(state, before, size) if before != size else state), facts
 
 
 def _recount(state: TrainState, before: int, size: int) -> TrainState:

@@ -1,6 +1,5 @@
 """Several devices that learn together: their means in one process, and two processes from the command to the score."""
 
-import json
 import os
 import signal
 import subprocess
@@ -17,8 +16,11 @@ from toy_tasks import ObservedReward
 from mjx_walk import checkpoint, networks, returns
 from mjx_walk.algos.ppo import PPOConfig, make_ppo
 from mjx_walk.collectives import AXIS
+from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.metrics import read_rows
 from mjx_walk.team import OWN
+from mjx_walk.team_checkpoint import restore_newest
 
 KEY = jax.random.PRNGKey(0)
 CHUNK = 2 * TINY_CHUNK
@@ -28,6 +30,11 @@ CHUNK = 2 * TINY_CHUNK
 def halves(tree):
     """The first axis in two."""
     return jax.tree.map(lambda x: x.reshape((2, -1, *x.shape[1:])), tree)
+
+
+def by_copy(x):
+    """The second axis in two: `[T, B]` to `[2, T, B/2]`."""
+    return jnp.stack(jnp.split(x, 2, axis=1))
 
 
 def twice(tree):
@@ -45,7 +52,6 @@ def test_two_devices_learn_what_one_learns_from_both_batches():
     algorithm = make_ppo(ObservedReward(), 16, EvaluationConfig(1), config)
     state, batch = jax.jit(algorithm.collect)(algorithm.init(KEY))
     alone, _ = jax.jit(algorithm.learn)(state, batch)
-    by_copy = lambda x: jnp.stack(jnp.split(x, 2, axis=1))  # noqa: E731
     parts = twice(batch).replace(
         transitions=halves(batch.transitions), rewards=by_copy(batch.rewards), ended=by_copy(batch.ended)
     )
@@ -66,20 +72,21 @@ def test_running_statistics_are_of_all_devices():
     assert_close(jax.tree.map(lambda x: x[1], together), alone)
     update = lambda scale, reward, ended: returns.update_return_scale(scale, reward, ended, 0.9)  # noqa: E731
     whole = update(returns.init_return_scale(8), reward, ended)
-    split = lambda x: jnp.stack(jnp.split(x, 2, axis=1))  # noqa: E731
-    parts = jax.vmap(update, axis_name=AXIS)(twice(returns.init_return_scale(4)), split(reward), split(ended))
+    parts = jax.vmap(update, axis_name=AXIS)(twice(returns.init_return_scale(4)), by_copy(reward), by_copy(ended))
     for name in ("count", "mean", "variance"):
         np.testing.assert_allclose(getattr(parts, name)[0], getattr(whole, name), rtol=1e-4)
+
+
+def test_a_checkpoint_of_another_run_is_refused_not_passed_over(tmp_path):
+    checkpoint.save(checkpoint.step_path(tmp_path, 10), {"a": np.zeros(3)}, {"env_steps": 10})
+    with pytest.raises(UserError, match="is of another run"):
+        restore_newest(tmp_path, {"a": np.zeros(4)}, None)
 
 
 def run(run_dir, *arguments, tiny=TINY, devices=2):
     done = command("train", *tiny, f"run_dir={run_dir}", f"devices={devices}", "checkpoint.every_chunks=1", *arguments)
     assert done.returncode == 0, done.stdout + done.stderr
     return done
-
-
-def rows(run_dir):
-    return [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
 
 
 def newest(run_dir):
@@ -102,7 +109,12 @@ def test_two_processes_learn_the_same_and_resume_exactly(tmp_path, tiny):
         is_own = name.split(".")[0] in OWN or name == "return_scale.running_return"
         assert is_own or np.array_equal(leaf, second[name]), name
     assert not np.array_equal(first["env.env.obs"], second["env.env.obs"])
-    assert [row["env_steps"] for row in rows(tmp_path / "whole")] == [CHUNK, 2 * CHUNK, 3 * CHUNK, 4 * CHUNK]
+    assert [row["env_steps"] for row in read_rows(tmp_path / "whole" / "metrics.jsonl")] == [
+        CHUNK,
+        2 * CHUNK,
+        3 * CHUNK,
+        4 * CHUNK,
+    ]
     run(tmp_path / "parted", f"total_steps={2 * CHUNK}", tiny=tiny)
     run(tmp_path / "parted", f"total_steps={4 * CHUNK}", "resume=true", tiny=tiny)
     for one, two in zip(newest(tmp_path / "whole"), newest(tmp_path / "parted"), strict=True):
@@ -130,7 +142,7 @@ def test_a_process_that_dies_ends_the_run_which_goes_on_from_its_checkpoint(tmp_
     assert not (tmp_path / "run" / "eval_gymnasium.json").exists()
     done = command("train", *settings, "resume=true")
     assert done.returncode == 0, done.stderr
-    assert rows(tmp_path / "run")[-1]["env_steps"] == 60 * CHUNK
+    assert read_rows(tmp_path / "run" / "metrics.jsonl")[-1]["env_steps"] == 60 * CHUNK
 
 
 @pytest.mark.slow
@@ -146,5 +158,5 @@ def test_a_signal_stops_all_devices_at_the_same_step(tmp_path):
     out, _ = parent.communicate(timeout=120)
     assert parent.returncode == 128 + signal.SIGTERM and "Stopped by SIGTERM and saved" in out
     checkpoints = tmp_path / "run" / "checkpoints"
-    newest = [sorted(path.name for path in folder.glob("0*"))[-1] for folder in (checkpoints, checkpoints / "device_1")]
-    assert newest[0] == newest[1]
+    first, second = (checkpoint.list_steps(folder)[-1] for folder in (checkpoints, checkpoints / "device_1"))
+    assert first.name == second.name

@@ -10,7 +10,7 @@ from mjx_walk.envs import Task
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.noise import OrnsteinUhlenbeck
 from mjx_walk.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
-from mjx_walk.policy_gradient import PolicyGradientConfig, Samples, check_minibatches, flatten, learn_once, normalize
+from mjx_walk.policy_gradient import PolicyGradientConfig, Samples, check_minibatches, learn_once, normalize
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -67,6 +67,6 @@ def make_a2c(task: Task, num_envs: int, evaluation: EvaluationConfig, config: A2
             advantages = normalize(advantages, weight)
         acted = data.extras["policy_extras"]
         samples = Samples(data.observation, acted["raw_action"], acted["log_prob"], advantages, weight, targets)
-        return learn_once(ground, config, state, batch, flatten(samples), value_loss)
+        return learn_once(ground, config, state, batch, samples, value_loss)
 
     return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)

@@ -11,7 +11,7 @@ from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
-from mjx_walk.policy_gradient import PolicyGradientConfig, Samples, check_minibatches, flatten, learn_once, normalize
+from mjx_walk.policy_gradient import PolicyGradientConfig, Samples, check_minibatches, learn_once, normalize
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
 
@@ -76,7 +76,7 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
             advantage = normalize(advantage - linear_fit(obs, advantage, weight), weight)
         acted = jax.tree.map(lambda x: x[:, :num_learned], data.extras["policy_extras"])
         samples = Samples(obs, acted["raw_action"], acted["log_prob"], advantage, weight, target=())
-        new_state, metrics = learn_once(ground, config, state, batch, flatten(samples), no_value_loss)
+        new_state, metrics = learn_once(ground, config, state, batch, samples, no_value_loss)
         return new_state, metrics | {"learned_from": weight.mean() * num_learned / config.unroll_length}
 
     return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)
@@ -102,7 +102,8 @@ def linear_fit(obs: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Arra
     Returns:
         `[N, T]`.
     """
-    features = jnp.concatenate([standardize(obs), standardize(jnp.square(standardize(obs)))], axis=-1)
+    linear = standardize(obs)
+    features = jnp.concatenate([linear, standardize(jnp.square(linear))], axis=-1)
     product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
     ridge = _RIDGE * jnp.maximum(weight.sum(), 1.0) * jnp.eye(features.shape[-1])
     gram = product("nt,ntf,ntg->fg", weight, features, features) + ridge
