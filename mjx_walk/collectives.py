@@ -1,4 +1,4 @@
-"""Means and sums over the devices that learn together, inside a program; where there is one device, nothing happens."""
+"""Means, sums and maxima over the devices that learn together, inside a program; on one device nothing happens."""
 
 from typing import Any
 
@@ -24,3 +24,8 @@ def mean(tree: Any) -> Any:
 def total(tree: Any) -> Any:
     """Sums over the devices."""
     return jax.lax.psum(tree, AXIS) if axis() else tree
+
+
+def largest(tree: Any) -> Any:
+    """Maxima over the devices."""
+    return jax.lax.pmax(tree, AXIS) if axis() else tree

@@ -77,18 +77,21 @@ class _BoundedNormal(NormalDistribution):
         return super().create_dist((mean, jnp.clip(std, *self._std_bounds)))
 
 
-def make_sac_networks(task: Task, config: Any) -> sac_networks.SACNetworks:
-    """Policy and twin critics of Brax's SAC, for one task, each of its own size, on normalised observations.
+def make_sac_networks(
+    task: Task, config: Any, critics: brax_networks.FeedForwardNetwork | None = None
+) -> sac_networks.SACNetworks:
+    """Policy and critics of Brax's SAC, for one task, each of its own size, on normalised observations.
 
     Args:
         task: gives the sizes.
         config: with `policy_hidden_layer_sizes`, `policy_layer_norm`, the same two for `critic`, `activation` and
             `network_dtype`.
+        critics: instead of the usual two; they give `[…, num_critics]`.
     """
     distribution = NormalTanhDistribution(event_size=task.action_size)
     return sac_networks.SACNetworks(
         policy_network=_policy_network(distribution.param_size, task, config),
-        q_network=_critic_network(2, task, config),
+        q_network=critics or _scalar_critics(2, task, config),
         parametric_action_distribution=distribution,
     )
 
@@ -97,7 +100,7 @@ def make_deterministic_networks(
     task: Task, config: Any, num_critics: int
 ) -> tuple[brax_networks.FeedForwardNetwork, brax_networks.FeedForwardNetwork]:
     """A policy whose outputs are to be squashed by tanh, and critics; settings as for `make_sac_networks`."""
-    return _policy_network(task.action_size, task, config), _critic_network(num_critics, task, config)
+    return _policy_network(task.action_size, task, config), _scalar_critics(num_critics, task, config)
 
 
 def _policy_network(num_outputs: int, task: Task, config: Any) -> brax_networks.FeedForwardNetwork:
@@ -112,13 +115,27 @@ def _policy_network(num_outputs: int, task: Task, config: Any) -> brax_networks.
     return _compute_in(config.network_dtype, network)
 
 
-def _critic_network(num_critics: int, task: Task, config: Any) -> brax_networks.FeedForwardNetwork:
+def _scalar_critics(num_critics: int, task: Task, config: Any) -> brax_networks.FeedForwardNetwork:
+    network = make_critics(num_critics, 1, task, config)
+    return dataclasses.replace(network, apply=lambda *inputs: network.apply(*inputs)[..., 0])
+
+
+def make_critics(num_critics: int, num_outputs: int, task: Task, config: Any) -> brax_networks.FeedForwardNetwork:
     """Brax's critics, their parameters stacked: one batched product in the place of several small ones.
 
     Inputs are padded with zeros to a multiple of eight, without which a GPU's tensor cores cannot read their rows.
+
+    Args:
+        num_critics: networks of the same shape.
+        num_outputs: of each.
+        task: gives the sizes.
+        config: as for `make_sac_networks`.
+
+    Returns:
+        A network that gives `[…, num_critics, num_outputs]` for observations and actions.
     """
     critic = brax_networks.MLP(
-        layer_sizes=(*config.critic_hidden_layer_sizes, 1),
+        layer_sizes=(*config.critic_hidden_layer_sizes, num_outputs),
         activation=ACTIVATION[config.activation],
         layer_norm=config.critic_layer_norm,
     )
@@ -132,9 +149,8 @@ def _critic_network(num_critics: int, task: Task, config: Any) -> brax_networks.
         return params
 
     def apply(_: Any, params: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
-        """`[…, num_critics]`."""
         inputs = jnp.concatenate([obs, action, jnp.zeros((*obs.shape[:-1], padding), obs.dtype)], axis=-1)
-        return jax.vmap(critic.apply, (0, None), -1)(params, inputs.astype(config.network_dtype))[..., 0, :]
+        return jax.vmap(critic.apply, (0, None), -2)(params, inputs.astype(config.network_dtype))
 
     return _compute_in(config.network_dtype, brax_networks.FeedForwardNetwork(init=init, apply=apply))
 

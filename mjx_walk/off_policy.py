@@ -55,6 +55,8 @@ class OffPolicyConfig:
     reward_scale: float = setting(1.0, above=0)
     normalize_rewards: bool = False
     """Divide rewards by the running std of the discounted return, before `reward_scale`."""
+    return_bound: float | None = setting(None, above=0)
+    """Divide them by more, if it takes that to keep every discounted return seen within this."""
     normalize_observations: bool = True
     observation_clip: float | None = setting(10.0, above=0)
     """Bound of normalised observations."""
@@ -207,7 +209,7 @@ def make_off_policy(
         return_scale = returns.update_return_scale(state.return_scale, steps.reward, ended, config.discount)
         reward_scale = jnp.float32(config.reward_scale)
         if config.normalize_rewards:
-            reward_scale *= returns.reward_multiplier(return_scale)
+            reward_scale *= returns.reward_multiplier(return_scale, config.return_bound)
         remaining = anneal(state.updates * float(steps_per_update), config.schedule_steps)
         rate_factor = factor(config.learning_rate_schedule, remaining)
         replay = buffer.insert(state.replay, steps)

@@ -1,7 +1,6 @@
 """What on-policy algorithms share: networks, and collecting trajectories whose time limits are bootstrapped through."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,13 +13,12 @@ from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as brax_ppo_networks
 from brax.training.networks import ACTIVATION
 
-from mjx_walk import collectives, networks, returns, rollout
+from mjx_walk import networks, returns, rollout
 from mjx_walk.envs import Task
-from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
 from mjx_walk.noise import OrnsteinUhlenbeck
 from mjx_walk.optimizers import make_adam
-from mjx_walk.schedules import adapt_rate, anneal, factor
+from mjx_walk.schedules import anneal
 from mjx_walk.settings import setting
 from mjx_walk.types import Metrics, PolicyFn, Transition
 from mjx_walk.wrappers import VectorEnv, VectorState
@@ -241,61 +239,6 @@ def make_on_policy(
         return anneal(state.updates * float(steps_per_update), config.schedule_steps)
 
     return OnPolicyGround(nets, optimizer, init, collect, policy_params, policy, steps_per_update, remaining)
-
-
-def learning_rates(config: OnPolicyConfig, state: OnPolicyState, remaining: jax.Array) -> ppo_losses.PPONetworkParams:
-    """Those of policy and value network, under the schedule."""
-    share = factor(config.learning_rate_schedule, remaining)
-    return ppo_losses.PPONetworkParams(policy=state.learning_rate * share, value=config.learning_rate * share)
-
-
-def after_update(
-    config: OnPolicyConfig,
-    state: OnPolicyState,
-    batch: OnPolicyBatch,
-    params: ppo_losses.PPONetworkParams,
-    optimizer: optax.OptState,
-    normalizer: RunningStatisticsState,
-    kl: jax.Array,
-    key: jax.Array,
-) -> OnPolicyState:
-    """`state` with what an update has changed, and a learning rate that follows the KL it ended at if it is to."""
-    rate = state.learning_rate
-    if config.learning_rate_schedule == "adaptive_kl":
-        rate = adapt_rate(rate, collectives.mean(kl), config.target_kl)
-    return state.replace(
-        params=params,
-        optimizer=optimizer,
-        learning_rate=rate,
-        normalizer=normalizer,
-        return_scale=returns.update_return_scale(state.return_scale, batch.rewards, batch.ended, config.discount),
-        key=key,
-        updates=state.updates + 1,
-    )
-
-
-def require_several_gradient_steps(config: OnPolicyConfig, num_gradient_steps: int) -> None:
-    """Check that a rate that is to adapt to the KL has one to adapt to.
-
-    Raises:
-        UserError: a batch's only gradient step is taken where the policy has not moved yet.
-    """
-    if config.learning_rate_schedule == "adaptive_kl" and num_gradient_steps == 1:
-        raise UserError("algo.learning_rate_schedule=adaptive_kl needs algo.num_minibatches of 2 or more")
-
-
-def require_whole_minibatches(num_envs: int, num_unrolls: int, num_minibatches: int) -> None:
-    """Check that the pieces of a batch can be dealt out evenly.
-
-    Raises:
-        UserError: they cannot.
-    """
-    if num_envs * num_unrolls % num_minibatches:
-        divisor = num_minibatches // math.gcd(num_minibatches, num_unrolls)
-        raise UserError(
-            f"num_envs={num_envs} times algo.num_unrolls={num_unrolls} does not divide into "
-            f"algo.num_minibatches={num_minibatches}; choose num_envs a multiple of {divisor}"
-        )
 
 
 def _pieces_first(x: jax.Array) -> jax.Array:

@@ -11,15 +11,8 @@ from brax.training.acme.running_statistics import RunningStatisticsState
 
 from mjx_walk import networks
 from mjx_walk.errors import UserError
-from mjx_walk.on_policy import (
-    OnPolicyBatch,
-    OnPolicyConfig,
-    OnPolicyGround,
-    OnPolicyState,
-    after_update,
-    learning_rates,
-    require_several_gradient_steps,
-)
+from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyGround, OnPolicyState
+from mjx_walk.on_policy_update import after_update, learning_rates, require_several_gradient_steps
 from mjx_walk.optimizers import descend
 from mjx_walk.schedules import factor
 from mjx_walk.settings import setting

@@ -73,7 +73,7 @@ def returns_to_go(
 
 
 class ReturnScale(flax.struct.PyTreeNode):
-    """Running variance of the discounted return, by which rewards may be normalised.
+    """Running variance and bound of the discounted return, by which rewards may be normalised.
 
     Source: `VecNormalize` of Stable-Baselines3 (`r / std(G)`, with `G ← γ G + r` running through each copy).
     """
@@ -83,11 +83,13 @@ class ReturnScale(flax.struct.PyTreeNode):
     count: jax.Array
     mean: jax.Array
     variance: jax.Array
+    largest: jax.Array
+    """The largest `|G|` so far."""
 
 
 def init_return_scale(num_envs: int) -> ReturnScale:
     """Unit scale, nothing seen yet."""
-    return ReturnScale(jnp.zeros(num_envs), jnp.float32(1e-4), jnp.float32(0.0), jnp.float32(1.0))
+    return ReturnScale(jnp.zeros(num_envs), jnp.float32(1e-4), jnp.float32(0.0), jnp.float32(1.0), jnp.float32(0.0))
 
 
 def update_return_scale(scale: ReturnScale, reward: jax.Array, done: jax.Array, discount: float) -> ReturnScale:
@@ -107,9 +109,14 @@ def update_return_scale(scale: ReturnScale, reward: jax.Array, done: jax.Array, 
     mean = scale.mean + delta * batch_count / count
     squares = scale.variance * scale.count + batch_variance * batch_count
     variance = (squares + delta**2 * scale.count * batch_count / count) / count
-    return ReturnScale(running, count, mean, variance)
+    largest = jnp.maximum(scale.largest, collectives.largest(jnp.abs(returns).max()))
+    return ReturnScale(running, count, mean, variance, largest)
 
 
-def reward_multiplier(scale: ReturnScale) -> jax.Array:
-    """`1 / std(G)`."""
-    return jax.lax.rsqrt(scale.variance + 1e-8)
+def reward_multiplier(scale: ReturnScale, bound: float | None = None) -> jax.Array:
+    """`1 / std(G)`; with a bound less where that would lift the largest `|G|` above it.
+
+    Source of the bound: SimbaV2 (Lee et al. 2025).
+    """
+    multiplier = jax.lax.rsqrt(scale.variance + 1e-8)
+    return multiplier if bound is None else jnp.minimum(multiplier, bound / (scale.largest + 1e-8))

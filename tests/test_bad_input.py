@@ -16,7 +16,7 @@ CASES = [
     (["env=ant"], "unknown env 'ant'; choose one of: humanoid, humanoid_standup, walker2d"),
     (["seed=1", "seeds=2"], "give seed=N or seeds=[…], not both"),
     (["seeds=[1,1]"], "seeds=[1, 1]: give a number of seeds, or a list of different seeds from 0 up"),
-    (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo, sac, td3, ddpg, a2c, reinforce"),
+    (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo, sac, csac, td3, ddpg, a2c, reinforce"),
     (["physics=bullet"], "physics=bullet: choose one of: auto, warp, jax, c"),
     (["env.version=v3"], "env.version=v3: choose one of: v5, v4"),
     (["recipe=nope"], "recipes: cpu/humanoid_a2c"),

@@ -12,6 +12,7 @@ from brax.training.acme import running_statistics
 
 from mjx_walk import networks
 from mjx_walk.algos import ALGORITHMS
+from mjx_walk.algos.csac import make_csac_networks
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.loop import make_chunk, make_init
 
@@ -52,10 +53,12 @@ SETTINGS = {
     },
     "reinforce": SMALL | {"unroll_length": 8, "learning_rate": 1e-2, "entropy_cost": 1e-2},
     "sac": OFF_POLICY | {"init_alpha": 1e-3, "alpha_learning_rate": 1e-6},
+    "csac": OFF_POLICY
+    | {"init_alpha": 1e-3, "alpha_learning_rate": 1e-6, "normalize_rewards": False, "return_bound": 3.0},
     "td3": DETERMINISTIC,
     "ddpg": DETERMINISTIC,
 }
-UPDATES = {"ppo": 60, "a2c": 400, "reinforce": 400, "sac": 400, "td3": 400, "ddpg": 400}
+UPDATES = {"ppo": 60, "a2c": 400, "reinforce": 400, "sac": 400, "csac": 400, "td3": 400, "ddpg": 400}
 
 
 def values(name, task, config, state, obs):
@@ -68,7 +71,10 @@ def values(name, task, config, state, obs):
     action = ALGORITHMS[name][0](task, 8, EvaluationConfig(1), config).policy(
         (state.normalizer, state.learner.policy), deterministic=True
     )(obs, jax.random.PRNGKey(0))
-    critics = networks.make_deterministic_networks(task, config, 1 if name == "ddpg" else 2)[1]
+    if name == "csac":
+        critics = make_csac_networks(task, config)[0].q_network
+    else:
+        critics = networks.make_deterministic_networks(task, config, 1 if name == "ddpg" else 2)[1]
     obs = running_statistics.normalize(obs, state.normalizer)
     return critics.apply(None, state.learner.critic, obs, action).min(axis=-1)
 
@@ -152,7 +158,7 @@ def test_mountain_car_equals_gymnasiums():
     assert ends >= 1
 
 
-@pytest.mark.parametrize("name", ["sac", "td3", "ddpg"])
+@pytest.mark.parametrize("name", ["sac", "csac", "td3", "ddpg"])
 def test_mountain_car_is_solved(name):
     """No reward until the top, which noise reaches only when each draw is kept for a while. Solved is 90."""
     changes = {
@@ -167,7 +173,8 @@ def test_mountain_car_is_solved(name):
         "noise_repeat": 20,
         "n_step": 10,
     }
-    own = {"sac": {"init_alpha": 1.0, "alpha_learning_rate": 3e-4, "target_entropy": 0.0}}
+    soft = {"init_alpha": 1.0, "alpha_learning_rate": 3e-4, "target_entropy": 0.0}
+    own = {"sac": soft, "csac": soft | {"return_bound": 10.0}}
     make, config_class = ALGORITHMS[name]
     config = config_class(**SETTINGS[name] | changes | own.get(name, {"max_exploration_noise": 1.0}))
     algorithm = make(toy_tasks.MountainCar(), 64, EvaluationConfig(8), config)

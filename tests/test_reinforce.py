@@ -26,7 +26,7 @@ def learned(task, **changes):
     config = REINFORCEConfig(**SETTINGS, **changes)
     algorithm = make_reinforce(task, NUM_ENVS, EvaluationConfig(1), config)
     state, batch = jax.jit(algorithm.collect)(jax.jit(algorithm.init)(jax.random.PRNGKey(0)))
-    return config, state, batch, jax.jit(algorithm.learn)(state, batch)[1]
+    return config, state, batch, jax.jit(algorithm.learn)(state.replace(updates=jnp.int32(1)), batch)[1]
 
 
 def test_loss_over_the_steps_whose_future_was_seen():

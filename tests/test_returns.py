@@ -49,6 +49,9 @@ def test_return_scale_is_the_std_of_discounted_returns():
         returns.append(running.copy())
         running[d] = 0.0
     np.testing.assert_allclose(reward_multiplier(scale), 1 / np.std(returns), rtol=1e-4)
+    bound = 0.5 * np.abs(returns).max() / np.std(returns)
+    np.testing.assert_allclose(reward_multiplier(scale, bound), bound / np.abs(returns).max(), rtol=1e-4)
+    np.testing.assert_allclose(reward_multiplier(scale, 4 * bound), 1 / np.std(returns), rtol=1e-4)
     np.testing.assert_allclose(scale.mean, np.mean(returns), rtol=1e-4)
 
 

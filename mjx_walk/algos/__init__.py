@@ -3,6 +3,7 @@
 from typing import Any
 
 from mjx_walk.algos.a2c import A2CConfig, make_a2c
+from mjx_walk.algos.csac import CSACConfig, make_csac
 from mjx_walk.algos.ddpg import DDPGConfig, make_ddpg
 from mjx_walk.algos.ppo import PPOConfig, make_ppo
 from mjx_walk.algos.reinforce import REINFORCEConfig, make_reinforce
@@ -15,6 +16,7 @@ from mjx_walk.types import Algorithm
 ALGORITHMS: dict[str, tuple[Any, type]] = {
     "ppo": (make_ppo, PPOConfig),
     "sac": (make_sac, SACConfig),
+    "csac": (make_csac, CSACConfig),
     "td3": (make_td3, TD3Config),
     "ddpg": (make_ddpg, DDPGConfig),
     "a2c": (make_a2c, A2CConfig),

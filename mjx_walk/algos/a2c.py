@@ -10,6 +10,7 @@ from mjx_walk.envs import Task
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.noise import OrnsteinUhlenbeck
 from mjx_walk.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
+from mjx_walk.on_policy_update import make_algorithm
 from mjx_walk.policy_gradient import PolicyGradientConfig, Samples, check_minibatches, learn_once, normalize
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
@@ -69,4 +70,4 @@ def make_a2c(task: Task, num_envs: int, evaluation: EvaluationConfig, config: A2
         samples = Samples(data.observation, acted["raw_action"], acted["log_prob"], advantages, weight, targets)
         return learn_once(ground, config, state, batch, samples, value_loss)
 
-    return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)
+    return make_algorithm(ground, learn)

@@ -11,13 +11,11 @@ from brax.training.agents.ppo import losses as ppo_losses
 from mjx_walk import networks
 from mjx_walk.envs import Task
 from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.on_policy import (
-    OnPolicyBatch,
-    OnPolicyConfig,
-    OnPolicyState,
+from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy
+from mjx_walk.on_policy_update import (
     after_update,
     learning_rates,
-    make_on_policy,
+    make_algorithm,
     require_several_gradient_steps,
     require_whole_minibatches,
 )
@@ -101,7 +99,7 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
             "reward_scale": batch.reward_scale,
         }
 
-    return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)
+    return make_algorithm(ground, learn)
 
 
 def _loss_metrics(metrics: Metrics) -> Metrics:

@@ -11,6 +11,7 @@ from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
+from mjx_walk.on_policy_update import make_algorithm
 from mjx_walk.policy_gradient import PolicyGradientConfig, Samples, check_minibatches, learn_once, normalize
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
@@ -79,7 +80,7 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
         new_state, metrics = learn_once(ground, config, state, batch, samples, no_value_loss)
         return new_state, metrics | {"learned_from": weight.mean() * num_learned / config.unroll_length}
 
-    return Algorithm(ground.init, ground.collect, learn, ground.policy_params, ground.policy, ground.steps_per_update)
+    return make_algorithm(ground, learn)
 
 
 _LARGEST = 5.0

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import flax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import optax
 from brax.training import types as brax_types
 from brax.training.agents.sac import losses as sac_losses
+from brax.training.agents.sac.networks import SACNetworks
 
 from mjx_walk import networks
 from mjx_walk.envs import Task
@@ -18,6 +20,8 @@ from mjx_walk.off_policy import Batch, Learner, OffPolicyConfig, make_off_policy
 from mjx_walk.optimizers import descend, make_adam, move_towards
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics
+
+MakeCriticLoss = Callable[[jax.Array], Callable[..., jax.Array]]
 
 
 @dataclasses.dataclass
@@ -49,12 +53,20 @@ def make_sac(task: Task, num_envs: int, evaluation: EvaluationConfig, config: SA
     return make_off_policy(task, num_envs, evaluation, config, make_sac_learner(task, config))
 
 
-def make_sac_learner(task: Task, config: SACConfig) -> Learner:
+def make_sac_learner(
+    task: Task, config: SACConfig, nets: SACNetworks | None = None, make_critic_loss: MakeCriticLoss | None = None
+) -> Learner:
     """SAC's networks and updates.
 
     Source: `sgd_step` of Brax's SAC: temperature, critic and policy take their gradients at the same, old parameters.
+
+    Args:
+        task: gives the sizes.
+        config: settings.
+        nets: other networks than Brax's.
+        make_critic_loss: another loss than Brax's, given the reward scale; called as Brax's is.
     """
-    nets = networks.make_sac_networks(task, config)
+    nets = nets or networks.make_sac_networks(task, config)
     optimizer = make_adam(config.max_grad_norm)
     # Brax's only use of the size is a target entropy of -0.5 nats for each action dimension.
     entropy_size = -2.0 * config.target_entropy * task.action_size
@@ -81,6 +93,8 @@ def make_sac_learner(task: Task, config: SACConfig) -> Learner:
 
     def critic_update(state: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, Metrics]:
         _, critic_loss, _ = losses(reward_scaling=batch.reward_scale)
+        if make_critic_loss:
+            critic_loss = make_critic_loss(batch.reward_scale)
         loss, grads = jax.value_and_grad(critic_loss)(
             state.critic,
             state.policy,
