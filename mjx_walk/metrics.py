@@ -56,13 +56,9 @@ def name_metrics(metrics: Metrics, reward_terms: tuple[str, ...], steps_per_upda
         last = {name: float(value[ended[-1]]) for name, value in scores.items()}
         row["eval/env_steps"] = last.pop("update") * steps_per_update
         row |= {f"eval/{name}": value for name, value in last.items()}
-    return row | {f"train/{name}": _mean(value) for name, value in values.items()}
-
-
-def _mean(values: np.ndarray) -> float:
-    """Over the updates that have the metric: off-policy algorithms learn nothing before their replay is filled."""
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if known.size else math.nan
+    # Over the updates that have it: nothing is learned from a first batch, or before a replay is filled.
+    known = {name: value[~np.isnan(value)] for name, value in values.items()}
+    return row | {f"train/{name}": float(value.mean()) for name, value in known.items() if value.size}
 
 
 class MetricsWriter:
