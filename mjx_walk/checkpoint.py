@@ -24,7 +24,7 @@ FORMAT = 1
 _META = "meta.json"
 _ARRAYS = "arrays"
 _NUMPY = "arrays.npz"
-"""What processes but the first write, into the same folders."""
+"""What processes but the first write into the same folders, and what is small."""
 _REPLAY = "replay"
 """The TrainState's field that is kept in the newest checkpoint only, in a part of its own."""
 
@@ -37,13 +37,14 @@ def to_host(tree: Any) -> HostArrays:
     return {name: np.array(leaf) for name, leaf in _named_leaves(jax.device_get(tree)).items()}
 
 
-def save(path: Path, tree: Any, meta: dict[str, Any]) -> None:
+def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False) -> None:
     """Write a pytree of arrays. The folder appears under its name only when it is complete.
 
     Args:
         path: folder to make; one that is there is replaced.
         tree: arrays of any dtype, or what `to_host` made of them.
         meta: JSON-able facts to keep beside it; version and checksums are added.
+        as_numpy: whether in one file of NumPy's instead of Orbax's folder.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
     meta = meta | {
@@ -55,9 +56,9 @@ def save(path: Path, tree: Any, meta: dict[str, Any]) -> None:
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
     replay = {name: x for name, x in arrays.items() if _is_replay(name)}
-    _write(unfinished / _ARRAYS, {name: x for name, x in arrays.items() if name not in replay})
+    _write(unfinished / _ARRAYS, {name: x for name, x in arrays.items() if name not in replay}, as_numpy)
     if replay:
-        _write(unfinished / _REPLAY, replay)
+        _write(unfinished / _REPLAY, replay, as_numpy)
     (unfinished / _META).write_text(json.dumps(meta))
     shutil.rmtree(path, ignore_errors=True)
     os.replace(unfinished, path)
@@ -215,8 +216,8 @@ def _is_replay(name: str) -> bool:
     return name.startswith(f"{_REPLAY}.")
 
 
-def _write(path: Path, arrays: HostArrays) -> None:
-    if jax.process_index():  # Orbax writes arrays of the host from the first process alone
+def _write(path: Path, arrays: HostArrays, as_numpy: bool) -> None:
+    if as_numpy or jax.process_index():  # Orbax writes arrays of the host from the first process alone
         path.mkdir()
         np.savez(path / _NUMPY, allow_pickle=False, **arrays)
         return

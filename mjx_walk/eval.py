@@ -2,13 +2,13 @@
 
 import dataclasses
 
-from mjx_walk import cli, run_folder
+from mjx_walk import cli, run_folder, zoo
 from mjx_walk.api import load_run
 from mjx_walk.errors import UserError
 from mjx_walk.settings import setting
 
 USAGE = """
-usage: python -m mjx_walk.eval run=RUN_DIR [episodes=100] [backend=gymnasium|sim] [seed=0] [physics=ENGINE]
+usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [episodes=100] [backend=gymnasium|sim] [seed=0] [physics=ENGINE]
 
   backend=gymnasium   the real environment, on the CPU; writes eval_gymnasium.json into the run folder
   backend=sim         the run's own engine, or another one by physics=
@@ -32,7 +32,7 @@ def main(arguments: list[str]) -> None:
     folder = run_folder.open_existing(parsed.run)
     run = load_run(parsed.run, parsed.physics)
     scores = run.evaluate(parsed.episodes, parsed.backend, parsed.seed)
-    if parsed.backend == "gymnasium":
+    if parsed.backend == "gymnasium" and not zoo.holds(folder.path):
         scores.save(folder.gymnasium_scores, env_steps=run.policy_facts["env_steps"])
     print(scores)
 

@@ -4,6 +4,7 @@ import dataclasses
 import datetime
 from pathlib import Path
 
+from mjx_walk import zoo
 from mjx_walk.checkpoint import list_steps
 from mjx_walk.config import Config, flatten, read_config, save_config
 from mjx_walk.errors import UserError
@@ -46,12 +47,12 @@ def new_path(config: Config) -> Path:
 
 
 def open_existing(path: str | Path) -> RunFolder:
-    """A folder that a run has written.
+    """A folder that a run has written, or `zoo:NAME`.
 
     Raises:
         UserError: there is no run at that path.
     """
-    folder = RunFolder(Path(path))
+    folder = RunFolder(zoo.find(path) if isinstance(path, str) and path.startswith(zoo.PREFIX) else Path(path))
     if not folder.config.is_file():
         raise UserError(f"no run at '{path}': give the folder that holds its config.yaml")
     return folder

@@ -153,7 +153,7 @@ def test_training_that_diverges_stops_and_keeps_what_was_saved_before(tmp_path):
     with pytest.raises(UserError, match=r"training has diverged: .* the policy of seed 0 is not finite"):
         train_command.main([*arguments, "algo.learning_rate=1e30"])
     assert 1 <= len((run / "metrics.jsonl").read_text().splitlines()) <= 3
-    # Nothing is learned from the first batch, so what was saved after it is sound; what came of the second is not saved.
+    # Nothing is learned from the first batch: what was saved after it is sound. What came of the second is not.
     assert sorted(path.name for path in (run / "checkpoints").iterdir()) == [f"{TINY_CHUNK:013d}", "best"]
     policy_params = mjx_walk.load_run(run).policy_params
     assert all(np.isfinite(np.asarray(leaf, np.float64)).all() for leaf in jax.tree.leaves(policy_params))

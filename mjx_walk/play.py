@@ -1,0 +1,78 @@
+"""`python -m mjx_walk.play run=RUN_DIR`: see a policy move, in the real Gymnasium."""
+
+import dataclasses
+from pathlib import Path
+
+from mjx_walk import cli, run_folder, zoo
+from mjx_walk.api import load_run
+from mjx_walk.episode import record_episode
+from mjx_walk.errors import UserError
+from mjx_walk.gait import draw_gait_sheet
+from mjx_walk.live_viewer import show
+from mjx_walk.rendering import write_film
+from mjx_walk.settings import setting
+
+USAGE = """
+usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [seed=0] [width=640] [height=480] [out=FILE.mp4] [gait=FILE.png]
+                               [viewer=true]
+
+  out=FILE.mp4    a film of one episode; written unless something else is asked for, by default RUN_DIR/episode.mp4, or
+                  NAME.mp4 here for a policy of the zoo
+  gait=FILE.png   a gait sheet: frames, torso height and speed, floor contacts, torques, reward terms
+  viewer=true     MuJoCo's live viewer, which needs a screen; episodes follow each other until it is closed
+"""
+
+
+@dataclasses.dataclass
+class Arguments:
+    run: str | None = None
+    out: str | None = None
+    gait: str | None = None
+    viewer: bool = False
+    seed: int = setting(0, at_least=0)
+    width: int = setting(640, at_least=64)
+    height: int = setting(480, at_least=64)
+
+
+def main(arguments: list[str]) -> None:
+    """Play, and write what was asked for."""
+    parsed = cli.parse(Arguments, arguments, USAGE)
+    if parsed.run is None:
+        raise UserError(f"say which run: run=RUN_DIR, or one of run={zoo.PREFIX}{f', {zoo.PREFIX}'.join(zoo.names())}")
+    folder = run_folder.open_existing(parsed.run)
+    film = Path(parsed.out) if parsed.out else None
+    if film is None and not (parsed.gait or parsed.viewer):
+        film = Path(f"{folder.path.name}.mp4") if zoo.holds(folder.path) else folder.path / "episode.mp4"
+    for path in (film, parsed.gait):
+        _check_writable(path)
+    run = load_run(parsed.run, "c")
+    if film or parsed.gait:
+        episode = record_episode(run.task, run.policy, parsed.seed, (parsed.width, parsed.height))
+        print(f"{episode.env}: return {episode.rewards.sum():,.1f} in {len(episode.rewards)} steps")
+        if film:
+            write_film(episode.frames, film, episode.frames_per_second)
+            print(film)
+        if parsed.gait:
+            print(draw_gait_sheet(episode, Path(parsed.gait)))
+    if parsed.viewer:
+        show(run.task, run.policy, parsed.seed)
+
+
+def _check_writable(path: str | Path | None) -> None:
+    """Before an episode is played for it.
+
+    Raises:
+        UserError: nothing can be written there.
+    """
+    if path is None:
+        return
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        with Path(path).open("ab"):
+            pass
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
+if __name__ == "__main__":
+    cli.main(main)

@@ -1,0 +1,59 @@
+"""`python -m mjx_walk.zoo`: list the policies that come with the package; for its authors: put a run's among them."""
+
+import dataclasses
+
+from mjx_walk import checkpoint, cli, run_folder, zoo
+from mjx_walk.api import load_run
+from mjx_walk.config import flatten, load_config, save_config
+from mjx_walk.errors import UserError
+from mjx_walk.run_folder import RunFolder
+
+USAGE = """
+usage: python -m mjx_walk.zoo                          list the policies
+       python -m mjx_walk.zoo add=RUN_DIR name=NAME    score a run's policy and put it there
+"""
+
+_NOT_LEARNED_FROM = ("run_dir", "resume", "physics", "hardware", "evaluation.", "checkpoint.", "compile_cache")
+"""Keys that a command may leave out and still train the same."""
+
+
+@dataclasses.dataclass
+class Arguments:
+    add: str | None = None
+    name: str | None = None
+
+
+def main(arguments: list[str]) -> None:
+    """List, or add."""
+    parsed = cli.parse(Arguments, arguments, USAGE)
+    if parsed.add is None:
+        print(zoo.table())
+        return
+    if parsed.name is None:
+        raise UserError("say under which name: name=humanoid-ppo")
+    source = run_folder.open_existing(parsed.add)
+    run = load_run(source.path, "auto")
+    scores = run.evaluate()
+    folder = RunFolder(zoo.empty_folder(parsed.name))
+    config = dataclasses.replace(run.config, physics="auto", run_dir=None, resume=False)
+    save_config(config, folder.config)
+    facts = {"env_steps": run.policy_facts["env_steps"]}
+    checkpoint.save(folder.best_policy, run.policy_params, facts, as_numpy=True)
+    scores.save(folder.gymnasium_scores, command=_command(config), **facts)
+    print(scores)
+
+
+def _command(config) -> str:
+    """What trains with these settings: the recipe, and what differs from it."""
+    given = [f"env={config.env.name}", f"algo={config.algo.name}"]
+    recipe, own = flatten(load_config([f"hardware={config.hardware}", *given])), flatten(config)
+    changes = [
+        f"{key}={own[key]}"
+        for key in sorted(own)
+        if not key.startswith(_NOT_LEARNED_FROM) and own[key] != recipe.get(key)
+    ]
+    return " ".join(["python -m mjx_walk.train", *given, *changes])
+
+
+if __name__ == "__main__":
+    cli.main(main)

@@ -1,0 +1,96 @@
+"""Films and gait sheets, from the real Gymnasium."""
+
+import imageio.v3 as iio
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from commands import command
+
+import mjx_walk
+from mjx_walk import rendering
+from mjx_walk.episode import record_episode
+from mjx_walk.errors import UserError
+
+
+def can_render():
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("MUJOCO_GL", "")
+        patched.delenv("MUJOCO_GL")
+        try:
+            rendering.choose_opengl()
+        except UserError:
+            return False
+        return True
+
+
+renders = pytest.mark.skipif(not can_render(), reason="nothing to render with: install libegl1 and libopengl0")
+
+
+@pytest.fixture(scope="module")
+def run():
+    return mjx_walk.load_run("zoo:walker2d-sac", "c")
+
+
+@renders
+def test_film_follows_the_walker_in_real_time(tmp_path, run):
+    done = command("play", "run=zoo:walker2d-sac", f"out={tmp_path}/new/walk.mp4", "width=321", "height=240")
+    assert done.returncode == 0 and "return 7," in done.stdout, done.stderr
+    film = tmp_path / "new" / "walk.mp4"
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(film))
+    assert seconds == pytest.approx(8.0, abs=0.1) and frames == 250
+    early, late = (iio.imread(film, index=index, plugin="FFMPEG").astype(float) for index in (10, 240))
+    assert early.shape == (240, 320, 3)
+    # The walker, and nothing else here, is purple; after 50 m it still has to be in the middle.
+    for frame in (early, late):
+        purple = (frame[..., 0] > frame[..., 1] + 40) & (frame[..., 2] > frame[..., 1] + 40)
+        columns = np.flatnonzero(purple.any(axis=0))
+        assert columns.size > 10 and 80 < columns.mean() < 240
+
+
+def test_an_episode_holds_what_gymnasium_says(run):
+    episode = record_episode(run.task, run.policy, seed=3)
+    assert not episode.frames and len(episode.rewards) == 1000
+    total = sum(episode.reward_terms.values())
+    np.testing.assert_allclose(episode.rewards, total, atol=1e-9)
+    assert episode.rewards.sum() == pytest.approx(run.evaluate(1, seed=3).mean, rel=1e-6)
+    # It runs: the torso gets far, the feet and no other body touch the floor, and the motors stay within their gears.
+    assert episode.torso[-1, 0] > 30 and episode.seconds[-1] == pytest.approx(8.0)
+    touching = episode.floor_contacts.mean(axis=0)
+    names = [episode.model.body(i).name for i in np.flatnonzero(touching > 0.01)]
+    assert sorted(names) == ["foot", "foot_left"] and 0.1 < touching.max() < 0.9
+    assert 50 < np.abs(episode.torques).max() <= 100.0
+
+
+@renders
+def test_gait_sheet(tmp_path):
+    done = command("play", "run=zoo:humanoid_standup-td3", f"gait={tmp_path}/gait.png", "width=240", "height=180")
+    assert done.returncode == 0 and "HumanoidStandup-v5: return 400," in done.stdout, done.stderr
+    image = iio.imread(tmp_path / "gait.png")
+    assert image.shape[0] > 1000 and image.std() > 20
+    assert not list(tmp_path.glob("*.mp4"))
+
+
+def test_mistakes_cost_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    for arguments, message in (
+        ((), "say which run: run=RUN_DIR, or one of run=zoo:humanoid-csac, "),
+        (("run=nowhere",), "no run at 'nowhere'"),
+        (("run=zoo:walker2d-sac", f"out={tmp_path}/file/walk.mp4"), f"cannot write {tmp_path}/file/walk.mp4"),
+        (("run=zoo:walker2d-sac", "viewer=true"), "viewer=true needs a screen"),
+    ):
+        done = command("play", *arguments)
+        assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
+
+
+def test_opengl_is_chosen_and_what_is_missing_is_said(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    rendering.choose_opengl()  # the user's stays
+    monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.setattr(rendering.sys, "platform", "linux")
+    monkeypatch.setattr(rendering, "_PROBE", "import os; assert os.environ['MUJOCO_GL'] == 'osmesa'")
+    rendering.choose_opengl()
+    assert rendering.os.environ["MUJOCO_GL"] == "osmesa"
+    monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.setattr(rendering, "_PROBE", "raise SystemExit(1)")
+    with pytest.raises(UserError, match="nothing to render with: install EGL or OSMesa"):
+        rendering.choose_opengl()

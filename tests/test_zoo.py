@@ -1,0 +1,53 @@
+"""The policies that come with the package."""
+
+import json
+
+import numpy as np
+import pytest
+from commands import command
+
+import mjx_walk
+from mjx_walk import zoo
+from mjx_walk.config import flatten, load_config, read_config
+from mjx_walk.run_folder import open_existing
+
+NAMES = zoo.names()
+
+
+def test_three_tasks_and_the_main_algorithms_are_there():
+    wanted = {f"{env}-{algo}" for env in ("humanoid", "humanoid_standup", "walker2d") for algo in ("ppo", "sac", "td3")}
+    assert wanted | {"humanoid-csac"} <= set(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_policy_is_small_and_scores_about_what_it_did(name):
+    folder = open_existing(f"zoo:{name}")
+    assert sum(path.stat().st_size for path in folder.path.rglob("*") if path.is_file()) < 1_000_000
+    facts = json.loads(folder.gymnasium_scores.read_text())
+    assert len(facts["returns"]) == 100 and np.mean(facts["returns"]) == pytest.approx(facts["mean"])
+    run = mjx_walk.load_run(f"zoo:{name}")
+    assert run.evaluate(episodes=1).mean > 0.8 * facts["mean"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_its_command_gives_its_settings(name):
+    folder = open_existing(f"zoo:{name}")
+    words = json.loads(folder.gymnasium_scores.read_text())["command"].split()
+    assert words[:3] == ["python", "-m", "mjx_walk.train"]
+    asked, own = flatten(load_config(["hardware=gpu", *words[3:]])), flatten(read_config(folder.config))
+    learned_from = [key for key in own if key.startswith(("env.", "algo.")) or key in ("num_envs", "total_steps")]
+    assert {key: asked[key] for key in learned_from} == {key: own[key] for key in learned_from}
+
+
+def test_scoring_one_does_not_write_into_the_package():
+    before = (open_existing("zoo:walker2d-sac").gymnasium_scores).read_bytes()
+    done = command("eval", "run=zoo:walker2d-sac", "episodes=1")
+    assert done.returncode == 0 and "Walker2d-v5: 7," in done.stdout, done.stderr
+    assert (open_existing("zoo:walker2d-sac").gymnasium_scores).read_bytes() == before
+
+
+def test_the_table_and_an_unknown_name():
+    done = command("zoo")
+    assert done.returncode == 0 and done.stdout.count("python -m mjx_walk.train") == len(NAMES)
+    done = command("eval", "run=zoo:humanoid-dqn")
+    assert done.returncode == 2 and "no policy 'humanoid-dqn' in the zoo; choose one of: " in done.stderr
