@@ -43,7 +43,9 @@ class Run:
         if physics is None and engine == "c" and jax.default_backend() != "cpu":
             engine = "auto"
         self.task = make_task(dataclasses.replace(self.config, physics=engine))
-        self._algorithm = make_algorithm(self.task, self.config.num_envs, self.config.evaluation, self.config.algo)
+        # It acts in float32, whatever it learned in: the same on every machine.
+        algo = dataclasses.replace(self.config.algo, network_dtype="float32")
+        self._algorithm = make_algorithm(self.task, self.config.num_envs, self.config.evaluation, algo)
         state = jax.eval_shape(self._algorithm.init, jax.random.PRNGKey(0))
         like = jax.eval_shape(self._algorithm.policy_params, state)
         self.policy_params, self.policy_facts = load_best_policy(folder, like)
@@ -54,7 +56,8 @@ class Run:
         return read_rows(self.path / "metrics.jsonl")
 
     @functools.cached_property
-    def _act(self) -> Callable:
+    def act(self) -> Callable:
+        """`policy` as a compiled JAX function of f32 observations."""
         return deterministic_act(self._algorithm, self.policy_params)
 
     def policy(self, obs: np.ndarray) -> np.ndarray:
@@ -63,12 +66,12 @@ class Run:
         Args:
             obs: `[…, observation_size]`, any float dtype.
         """
-        return np.asarray(self._act(np.asarray(obs, np.float32)))
+        return np.asarray(self.act(np.asarray(obs, np.float32)))
 
     def evaluate(self, episodes: int = 100, backend: str = "gymnasium", seed: int = 0) -> Scores:
         """Score the policy without noise; `backend` is `gymnasium` or `sim`, the run's own engine."""
         if backend == "gymnasium":
-            return score_in_gymnasium(self.task, self._act, episodes, seed)
+            return score_in_gymnasium(self.task, self.act, episodes, seed)
         policy = self._algorithm.policy(self.policy_params, deterministic=True)
         return score_in_sim(self.task, policy, episodes, seed)
 

@@ -4,6 +4,7 @@ import dataclasses
 import sys
 import typing
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import yaml
@@ -59,6 +60,20 @@ def read_seeds(value: Any) -> list[int]:
     if are_seeds and seeds and len(set(seeds)) == len(seeds):
         return seeds
     raise UserError(f"seeds={value}: give a number of seeds, or a list of different seeds from 0 up")
+
+
+def check_writable(path: Path) -> None:
+    """Before work is done for a file.
+
+    Raises:
+        UserError: nothing can be written there.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab"):
+            pass
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
 def main(command: Callable[[list[str]], int | None]) -> NoReturn:

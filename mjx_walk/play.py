@@ -44,7 +44,8 @@ def main(arguments: list[str]) -> None:
     if film is None and not (parsed.gait or parsed.viewer):
         film = Path(f"{folder.path.name}.mp4") if zoo.holds(folder.path) else folder.path / "episode.mp4"
     for path in (film, parsed.gait):
-        _check_writable(path)
+        if path:
+            cli.check_writable(Path(path))
     run = load_run(parsed.run, "c")
     if film or parsed.gait:
         episode = record_episode(run.task, run.policy, parsed.seed, (parsed.width, parsed.height))
@@ -56,22 +57,6 @@ def main(arguments: list[str]) -> None:
             print(draw_gait_sheet(episode, Path(parsed.gait)))
     if parsed.viewer:
         show(run.task, run.policy, parsed.seed)
-
-
-def _check_writable(path: str | Path | None) -> None:
-    """Before an episode is played for it.
-
-    Raises:
-        UserError: nothing can be written there.
-    """
-    if path is None:
-        return
-    try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        with Path(path).open("ab"):
-            pass
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
 if __name__ == "__main__":

@@ -1,0 +1,105 @@
+"""ONNX gives the actions that JAX gives."""
+
+import re
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import onnxruntime
+import pytest
+from commands import command
+from test_readme import blocks
+
+import mjx_walk
+from mjx_walk import zoo
+from mjx_walk.algos import make_algorithm
+from mjx_walk.api import make_task
+from mjx_walk.config import load_config
+from mjx_walk.errors import UserError
+from mjx_walk.onnx_graph import translate
+from mjx_walk.policies import deterministic_act
+
+
+def assert_equal(model, act, observations):
+    session = onnxruntime.InferenceSession(model.SerializeToString())
+    (found,) = session.run(["action"], {"observation": observations})
+    expected = np.asarray(act(np.float32(observations)))
+    assert found.shape == expected.shape and found.dtype == np.float32 and expected.std() > 0.01
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", zoo.names())
+def test_policies_of_the_zoo(name):
+    run = mjx_walk.load_run(f"zoo:{name}", "c")
+    normalizer = run.policy_params[0]
+    rng = np.random.default_rng(0)
+    observations = np.asarray(normalizer.mean) + 2.0 * np.asarray(normalizer.std) * rng.normal(
+        size=(64, run.task.observation_size)
+    )
+    model = translate(run.act, run.task.observation_size, name)
+    assert_equal(model, run.act, observations)
+    assert_equal(model, run.act, observations[:1])
+    assert len(model.SerializeToString()) < 1_000_000
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["algo=ppo", "algo.distribution=normal", "algo.activation=tanh"],
+        ["algo=a2c", "algo.state_dependent_std=true", "algo.activation=relu"],
+        ["algo=reinforce", "algo.activation=leaky_relu"],
+        ["algo=sac", "algo.policy_layer_norm=true", "algo.activation=elu"],
+        ["algo=sac", "algo.observation_clip=null", "algo.activation=gelu"],
+        ["algo=td3", "algo.policy_layer_norm=true", "algo.activation=silu", "env.version=v4"],
+        ["algo=ddpg", "algo.activation=softplus", "env=humanoid"],
+        ["algo=csac", "algo.activation=sigmoid"],
+    ],
+)
+def test_every_setting_of_the_networks(overrides):
+    """Random weights, of a size that spreads the actions."""
+    config = load_config(["env=walker2d", "physics=c", *overrides])
+    task = make_task(config)
+    algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
+    normalizer, params = algorithm.policy_params(jax.jit(algorithm.init)(jax.random.PRNGKey(0)))
+    normalizer = normalizer.replace(mean=normalizer.mean + 0.3, std=normalizer.std * 2.0)
+    rng = np.random.default_rng(0)
+
+    def drawn(x):
+        noise = rng.normal(size=x.shape)
+        return jnp.float32(noise * 1.5 / np.sqrt(len(x)) if x.ndim == 2 else x + 0.1 * noise)
+
+    params = jax.tree.map(drawn, params)
+    act = deterministic_act(algorithm, (normalizer, params))
+    observations = rng.normal(size=(64, task.observation_size))
+    assert_equal(translate(act, task.observation_size, "policy"), act, observations)
+
+
+def test_what_cannot_be_translated_is_named():
+    with pytest.raises(UserError, match="there is no translation for 'sort'"):
+        translate(jnp.sort, 5, "policy")
+
+
+def test_example_of_readme(tmp_path):
+    """Gymnasium driven by nothing but onnxruntime."""
+    done = command("export", "run=zoo:humanoid-csac", f"out={tmp_path}/humanoid-csac.onnx")
+    assert done.returncode == 0 and "observation [N, 348] → action [N, 17]" in done.stdout, done.stderr
+    (example,) = [block for block in blocks("python") if block.startswith("# without_jax.py")]
+    assert len(example.splitlines()) <= 15
+    example += '\nimport sys\nassert not {"jax", "mjx_walk"} & set(sys.modules)'
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (total,) = re.findall(r"return ([\d,]+)", done.stdout)
+    assert int(total.replace(",", "")) > 11_500
+
+
+def test_mistakes_cost_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    for arguments, message in (
+        ((), "say which run: run=RUN_DIR, or zoo:NAME"),
+        (("run=zoo:walker2d-sac", "format=tflite"), "format=tflite"),
+        (("run=zoo:walker2d-sac", f"out={tmp_path}/file/policy.onnx"), "cannot write"),
+    ):
+        done = command("export", *arguments)
+        assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
