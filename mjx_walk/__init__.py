@@ -3,6 +3,8 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from mjx_walk.registration import register
+
 __version__ = "0.1.0"
 __all__ = ["__version__", "load_run", "make_env", "run"]
 
@@ -18,3 +20,6 @@ def __getattr__(name: str) -> Any:
     if name in _WHERE:
         return getattr(importlib.import_module(_WHERE[name]), name)
     raise AttributeError(f"module 'mjx_walk' has no attribute '{name}'")
+
+
+register()
