@@ -9,7 +9,7 @@ from typing import Any
 
 from mjx_walk.envs.humanoid import Humanoid, HumanoidOptions
 from mjx_walk.envs.humanoid_standup import HumanoidStandup, HumanoidStandupOptions
-from mjx_walk.envs.task import State, Task, TaskOptions
+from mjx_walk.envs.task import NO_TIME_LIMIT, State, Task, TaskOptions
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.errors import UserError
 from mjx_walk.settings import validate
@@ -20,7 +20,7 @@ TASKS: dict[str, tuple[type[Task], type[TaskOptions]]] = {
     "walker2d": (Walker2d, Walker2dOptions),
 }
 
-__all__ = ["TASKS", "State", "Task", "TaskOptions", "make_env"]
+__all__ = ["NO_TIME_LIMIT", "TASKS", "State", "Task", "TaskOptions", "make_env"]
 
 
 def make_env(name: str, physics: str = "auto", **kwargs: Any) -> Task:

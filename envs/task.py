@@ -19,6 +19,9 @@ from mjx_walk.settings import setting
 MAX_ABS_VALUE = 1e10
 """A position or velocity beyond it is a broken simulation, as in MuJoCo's own check (`mjMAXVAL`)."""
 
+NO_TIME_LIMIT = 2**31 - 1
+"""`max_episode_steps` of a task whose time limit is kept by somebody else."""
+
 Memory = dict[str, jax.Array]
 """What a task remembers from the last step beside the physics state."""
 

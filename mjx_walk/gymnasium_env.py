@@ -12,10 +12,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from mjx_walk.envs import State, Task, make_env
-
-_NO_LIMIT = 2**31 - 1
-"""Of an environment whose time limit is Gymnasium's own wrapper."""
+from mjx_walk.envs import NO_TIME_LIMIT, State, Task, make_env
 
 
 class SingleEnv(gymnasium.Env):
@@ -30,7 +27,7 @@ class SingleEnv(gymnasium.Env):
             physics: engine.
             keywords: Gymnasium's, and those of `TaskOptions`.
         """
-        self._task = make_env(env, physics, **keywords | {"max_episode_steps": _NO_LIMIT})
+        self._task = make_env(env, physics, **keywords | {"max_episode_steps": NO_TIME_LIMIT})
         self.observation_space, self.action_space = _spaces(self._task)
         self._reset, self._step = jax.jit(self._task.reset), jax.jit(self._task.step)
         self._state: State | None = None
