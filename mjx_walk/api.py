@@ -23,6 +23,7 @@ from mjx_walk.metrics import Row, read_rows
 from mjx_walk.policies import deterministic_act, load_best_policy
 from mjx_walk.run_folder import MAY_DIFFER, RunFolder
 from mjx_walk.team import Team
+from mjx_walk.wandb_log import require_wandb
 
 
 class Run:
@@ -128,6 +129,7 @@ def train(
     Returns:
         The run folders, and the name of the signal that stopped them early, if one did.
     """
+    require_wandb(configs[0])
     physics = resolve_engine(configs[0].physics)
     configs = [dataclasses.replace(config, physics=physics) for config in configs]
     jax.config.update("jax_default_matmul_precision", configs[0].matmul_precision)

@@ -55,6 +55,8 @@ class Config:
     run_dir: str | None = None
     """By default `runs/ENV_ALGO/TIME`."""
     resume: bool = False
+    wandb_project: str | None = None
+    """Log to this project of Weights & Biases, too."""
     matmul_precision: str = setting("tensorfloat32", choices=("tensorfloat32", "float32"))
     """Of the networks; never of the physics."""
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)

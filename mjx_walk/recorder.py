@@ -14,6 +14,7 @@ from mjx_walk.run_folder import RunFolder
 from mjx_walk.team import Team
 from mjx_walk.team_checkpoint import NUM_DEVICES, device_folder, restore_newest
 from mjx_walk.types import Algorithm, TrainState
+from mjx_walk.wandb_log import WandbLog
 
 
 class Recorder:
@@ -37,6 +38,7 @@ class Recorder:
         self._saver = checkpoint.BackgroundSaver(self._checkpoints, config.checkpoint.keep)
         self._best_update = -1
         self._writer: MetricsWriter | None = None
+        self._wandb: WandbLog | None = None
         self._policies: list[tuple[Any, dict[str, Any]]] = []
 
     @property
@@ -57,6 +59,7 @@ class Recorder:
     def begin(self, env_steps: int, trains_on: bool) -> None:
         """Open the log, after `env_steps` if the run is resumed; an old score is forgotten if the run trains on."""
         self._writer = MetricsWriter(self._folder.path, env_steps if self.config.resume else None)
+        self._wandb = WandbLog(self.config, self._folder) if self.config.wandb_project else None
         if trains_on:
             self._folder.gymnasium_scores.unlink(missing_ok=True)  # of a shorter run
 
@@ -64,6 +67,8 @@ class Recorder:
         """Log a row."""
         assert self._writer
         self._writer.write(row)
+        if self._wandb:
+            self._wandb.write(row)
 
     def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:
         """Begin to save the whole state; and the best policy, if it is a new one. Before the first evaluation is over,
@@ -86,6 +91,8 @@ class Recorder:
         """Close the log, draw it, and remember the policies that may be scored."""
         assert self._writer
         self._writer.close()
+        if self._wandb:
+            self._wandb.close()
         plots.plot_run(self._folder.path)
         self._policies = [(self._algorithm.policy_params(state), {"env_steps": env_steps})]
         best = self._best_policy(state)

@@ -1,0 +1,59 @@
+"""Weights & Biases, offline."""
+
+import importlib.util
+import json
+
+import pytest
+from commands import TINY, TINY_CHUNK
+from wandb.proto.wandb_internal_pb2 import Record
+
+import mjx_walk
+from mjx_walk.errors import UserError
+
+
+def records(data):
+    """W&B's file: a header of 7 bytes, then records in LevelDB's log format, pieced together over blocks of 32 KiB."""
+    at, parts = 7, b""
+    while at + 7 <= len(data):
+        if 32768 - at % 32768 < 7:  # too little room for a piece's header
+            at += 32768 - at % 32768
+            continue
+        size, kind = int.from_bytes(data[at + 4 : at + 6], "little"), data[at + 6]
+        parts += data[at + 7 : at + 7 + size]
+        at += 7 + size
+        if kind in (1, 4):  # a whole record, or a last piece
+            yield Record.FromString(parts)
+            parts = b""
+
+
+def history(path):
+    """Step and values of all rows."""
+    rows = {}
+    for record in records(path.read_bytes()):
+        if record.WhichOneof("record_type") == "history":
+            items = record.history.item
+            values = {item.key or ".".join(item.nested_key): json.loads(item.value_json) for item in items}
+            rows[int(values["_step"])] = values
+    return rows
+
+
+def test_rows_are_logged_and_a_resumed_run_goes_on_in_the_same_one(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    arguments = [*TINY, f"run_dir={tmp_path}/run", "wandb_project=walking"]
+    mjx_walk.run([*arguments, f"total_steps={3 * TINY_CHUNK}"])
+    run = mjx_walk.run([*arguments, f"total_steps={6 * TINY_CHUNK}", "resume=true"])
+    files = sorted((tmp_path / "run" / "wandb").glob("offline-run-*/run-*.wandb"))
+    identity = (tmp_path / "run" / "wandb_id.txt").read_text()
+    assert len(files) == 2 and {path.stem for path in files} == {f"run-{identity}"}
+    logged = history(files[0]) | history(files[1])
+    assert list(logged) == [row["env_steps"] for row in run.metrics] and len(logged) == 6
+    for row in run.metrics[1:]:
+        assert logged[row["env_steps"]]["train/loss"] == pytest.approx(row["train/loss"])
+
+
+def test_without_the_package_nothing_is_begun(tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match="wandb_project=walking needs Weights & Biases: pip install wandb"):
+        mjx_walk.run([*TINY, f"run_dir={tmp_path}/run", "wandb_project=walking"])
+    assert not (tmp_path / "run").exists()
