@@ -62,6 +62,7 @@ def test_an_episode_holds_what_gymnasium_says(run):
 
 
 @renders
+@pytest.mark.slow
 def test_gait_sheet(tmp_path):
     done = command("play", "run=zoo:walker2d-td3", f"gait={tmp_path}/gait.png", "width=240", "height=180")
     assert done.returncode == 0 and "Walker2d-v5: return 6," in done.stdout, done.stderr

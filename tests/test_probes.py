@@ -158,7 +158,7 @@ def test_mountain_car_equals_gymnasiums():
     assert ends >= 1
 
 
-@pytest.mark.parametrize("name", ["sac", "csac", "td3", "ddpg"])
+@pytest.mark.parametrize("name", ["sac", pytest.param("csac", marks=pytest.mark.slow), "td3", "ddpg"])
 def test_mountain_car_is_solved(name):
     """No reward until the top, which noise reaches only when each draw is kept for a while. Solved is 90."""
     changes = {

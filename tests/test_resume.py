@@ -51,7 +51,7 @@ def test_n_and_n_chunks_equal_2n(tmp_path, physics):
     assert seconds == sorted(seconds)
 
 
-@pytest.mark.parametrize("algo", ["sac", "csac", "td3", "ddpg"])
+@pytest.mark.parametrize("algo", ["sac", "td3", "ddpg"])
 def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
     """The first half ends after the replay has gone round, with truncated episodes in it."""
     train(tmp_path / "whole", f"algo={algo}", f"total_steps={9 * TINY_CHUNK}", tiny=TINY_OFF_POLICY)
