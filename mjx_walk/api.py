@@ -5,6 +5,7 @@ import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -21,6 +22,7 @@ from mjx_walk.evaluation import Scores, score_in_gymnasium, score_in_sim
 from mjx_walk.loop import Trainer
 from mjx_walk.metrics import Row, read_rows
 from mjx_walk.policies import deterministic_act, load_best_policy
+from mjx_walk.rendering import choose_opengl
 from mjx_walk.run_folder import MAY_DIFFER, RunFolder
 from mjx_walk.team import Team
 from mjx_walk.wandb_log import require_wandb
@@ -130,6 +132,8 @@ def train(
         The run folders, and the name of the signal that stopped them early, if one did.
     """
     require_wandb(configs[0])
+    if configs[0].evaluation.films:
+        choose_opengl()
     physics = resolve_engine(configs[0].physics)
     configs = [dataclasses.replace(config, physics=physics) for config in configs]
     jax.config.update("jax_default_matmul_precision", configs[0].matmul_precision)
@@ -182,8 +186,10 @@ def _as_saved(config: Config, overrides: list[str]) -> Config:
     if not (config.resume and config.run_dir and given <= {*MAY_DIFFER, "hardware"}):
         return config
     saved = read_config(run_folder.open_existing(config.run_dir).config)
-    total_steps = config.total_steps if "total_steps" in given else saved.total_steps
-    return dataclasses.replace(saved, run_dir=config.run_dir, resume=True, total_steps=total_steps)
+    anew: dict[str, Any] = {key: getattr(config, key) for key in ("total_steps", "wandb_project") if key in given}
+    if "evaluation.films" in given:
+        anew["evaluation"] = dataclasses.replace(saved.evaluation, films=config.evaluation.films)
+    return dataclasses.replace(saved, run_dir=config.run_dir, resume=True, **anew)
 
 
 def _without_lost_reward(config: Config) -> Config:

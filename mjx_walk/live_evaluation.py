@@ -27,6 +27,8 @@ class EvaluationConfig:
     """Environment steps of training from the start of one round to the next, at least."""
     gymnasium_episodes: int = setting(100, at_least=0)
     """Episodes in the real Gymnasium after training; 0 leaves it out."""
+    films: bool = False
+    """Film an episode in the real Gymnasium at the end of each round, into `films/` and for TensorBoard."""
 
 
 class LiveEvaluation(flax.struct.PyTreeNode):

@@ -148,6 +148,7 @@ class Trainer:
                 recorder.write(row)
                 self._warn_of_overflow(row)
                 self._on_metrics(row)
+            self._film(state, rows)
             if not self._team or self._team.rank == 0:
                 progress.update(_mean_row(rows))
 
@@ -234,6 +235,14 @@ class Trainer:
             own = metrics if len(self.recorders) == 1 else {name: value[:, i] for name, value in metrics.items()}
             rows.append(common | name_metrics(own, self._task.reward_terms, self._steps_per_update) | speed)
         return rows
+
+    def _film(self, state: TrainState, rows: list[Row]) -> None:
+        """Film the policies of those runs whose round of evaluation has ended; a row may be one chunk behind them."""
+        policies = self.algorithm.policy_params(state)
+        for i, (recorder, row) in enumerate(zip(self.recorders, rows, strict=True)):
+            if "eval/return" in row:
+                own = jax.tree.map(lambda x, i=i: x[i], policies) if self._has_axis else policies
+                recorder.film(own, int(row["env_steps"]))
 
     def _warn_of_overflow(self, row: Row) -> None:
         if row["physics/overflow"] and not self._has_warned:

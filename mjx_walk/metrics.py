@@ -1,5 +1,6 @@
 """From the device's sums to named metrics, and where they are written."""
 
+import csv
 import json
 import math
 import sys
@@ -102,6 +103,17 @@ def read_rows(path: Path) -> list[Row]:
         except json.JSONDecodeError:
             break
     return rows
+
+
+def write_csv(rows: list[Row], path: Path) -> Path:
+    """The same rows as a table, whose columns are all names that any row has, in their order; an unknown value is
+    empty."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
 
 
 class Progress:

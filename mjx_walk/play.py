@@ -9,15 +9,17 @@ from mjx_walk.episode import record_episode
 from mjx_walk.errors import UserError
 from mjx_walk.gait import draw_gait_sheet
 from mjx_walk.live_viewer import show
+from mjx_walk.page import require_library, write_page
 from mjx_walk.rendering import write_film
 from mjx_walk.settings import setting
 
 USAGE = """
-usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [seed=0] [width=640] [height=480] [out=FILE.mp4] [gait=FILE.png]
-                               [viewer=true]
+usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [seed=0] [width=640] [height=480] [out=FILE.mp4] [html=FILE.html]
+                               [gait=FILE.png] [viewer=true]
 
   out=FILE.mp4    a film of one episode; written unless something else is asked for, by default RUN_DIR/episode.mp4, or
                   NAME.mp4 here for a policy of the zoo
+  html=FILE.html  a page that plays it in 3D in any browser, offline, beside its reward terms (pip install meshcat)
   gait=FILE.png   a gait sheet: frames, torso height and speed, floor contacts, torques, reward terms
   viewer=true     MuJoCo's live viewer, which needs a screen; episodes follow each other until it is closed
 """
@@ -27,6 +29,7 @@ usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [seed=0] [width=640] [height
 class Arguments:
     run: str | None = None
     out: str | None = None
+    html: str | None = None
     gait: str | None = None
     viewer: bool = False
     seed: int = setting(0, at_least=0)
@@ -41,18 +44,23 @@ def main(arguments: list[str]) -> None:
         raise UserError(f"say which run: run=RUN_DIR, or one of run={zoo.PREFIX}{f', {zoo.PREFIX}'.join(zoo.names())}")
     folder = run_folder.open_existing(parsed.run)
     film = Path(parsed.out) if parsed.out else None
-    if film is None and not (parsed.gait or parsed.viewer):
+    if parsed.html:
+        require_library()
+    if film is None and not (parsed.html or parsed.gait or parsed.viewer):
         film = Path(f"{folder.path.name}.mp4") if zoo.holds(folder.path) else folder.path / "episode.mp4"
-    for path in (film, parsed.gait):
+    for path in (film, parsed.html, parsed.gait):
         if path:
             cli.check_writable(Path(path))
     run = load_run(parsed.run, "c")
-    if film or parsed.gait:
-        episode = record_episode(run.task, run.policy, parsed.seed, (parsed.width, parsed.height))
+    if film or parsed.html or parsed.gait:
+        size = (parsed.width, parsed.height) if film or parsed.gait else None
+        episode = record_episode(run.task, run.policy, parsed.seed, size)
         print(f"{episode.env}: return {episode.rewards.sum():,.1f} in {len(episode.rewards)} steps")
         if film:
             write_film(episode.frames, film, episode.frames_per_second)
             print(film)
+        if parsed.html:
+            print(write_page(episode, Path(parsed.html)))
         if parsed.gait:
             print(draw_gait_sheet(episode, Path(parsed.gait)))
     if parsed.viewer:

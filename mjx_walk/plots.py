@@ -1,31 +1,59 @@
-"""Learning curves of a run, as PNG files in its folder."""
+"""`python -m mjx_walk.plots run=RUN_DIR`: learning curves of a run, in its folder."""
 
+import dataclasses
 from pathlib import Path
 
 import matplotlib.figure
 
-from mjx_walk.metrics import Row, read_rows
+from mjx_walk import cli, run_folder
+from mjx_walk.errors import UserError
+from mjx_walk.metrics import Row, read_rows, write_csv
+from mjx_walk.run_folder import RunFolder
+
+USAGE = """
+usage: python -m mjx_walk.plots run=RUN_DIR
+
+  Draws its curves again, which a run does at its end; it may still be training.
+"""
 
 AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))
 """What curves are drawn against: the key of a row, its unit, its label."""
 
 
-def plot_run(run_dir: Path) -> list[Path]:
+@dataclasses.dataclass
+class Arguments:
+    run: str | None = None
+
+
+def main(arguments: list[str]) -> None:
+    """Draw, and say what was written."""
+    parsed = cli.parse(Arguments, arguments, USAGE)
+    if parsed.run is None:
+        raise UserError("say which run: run=RUN_DIR")
+    folder = run_folder.open_existing(parsed.run)
+    written = plot_run(folder)
+    if not written:
+        raise UserError(f"{folder.path} has no metrics to draw")
+    print(*written, sep="\n")
+
+
+def plot_run(folder: RunFolder) -> list[Path]:
     """Draw the curves that `metrics.jsonl` holds.
 
     Returns:
-        `learning_curve.png` (return and episode length against steps and wall-clock), `reward_terms.png` and
-        `losses.png`; none where nothing was logged.
+        `learning_curve.png` (return and episode length against steps and wall-clock), `reward_terms.png`,
+        `losses.png`, and `metrics.csv`, all rows as a table; none where nothing was logged.
     """
-    rows = read_rows(run_dir / "metrics.jsonl")
+    rows = read_rows(folder.metrics)
     if not rows:
         return []
     terms = sorted({k for row in rows for k in row if k.startswith("episode/reward_")})
     losses = sorted({k for row in rows for k in row if k.startswith("train/")})
     return [
-        _learning_curve(rows, run_dir / "learning_curve.png"),
-        _grid(rows, terms, "per episode", run_dir / "reward_terms.png"),
-        _grid(rows, losses, "", run_dir / "losses.png"),
+        _learning_curve(rows, folder.path / "learning_curve.png"),
+        _grid(rows, terms, "per episode", folder.path / "reward_terms.png"),
+        _grid(rows, losses, "", folder.path / "losses.png"),
+        write_csv(rows, folder.path / "metrics.csv"),
     ]
 
 
@@ -72,3 +100,7 @@ def _grid(rows: list[Row], names: list[str], ylabel: str, path: Path) -> Path:
         plot.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
     return path
+
+
+if __name__ == "__main__":
+    cli.main(main)

@@ -8,6 +8,7 @@ from mjx_walk import checkpoint, plots
 from mjx_walk.config import Config
 from mjx_walk.envs import Task
 from mjx_walk.evaluation import Scores, score_in_gymnasium
+from mjx_walk.filming import Filmer
 from mjx_walk.metrics import MetricsWriter, Row
 from mjx_walk.policies import deterministic_act
 from mjx_walk.run_folder import RunFolder
@@ -39,6 +40,7 @@ class Recorder:
         self._best_update = -1
         self._writer: MetricsWriter | None = None
         self._wandb: WandbLog | None = None
+        self._filmer = Filmer(config, folder) if config.evaluation.films else None
         self._policies: list[tuple[Any, dict[str, Any]]] = []
 
     @property
@@ -70,6 +72,11 @@ class Recorder:
         if self._wandb:
             self._wandb.write(row)
 
+    def film(self, policy_params: Any, env_steps: int) -> None:
+        """Film a policy, if that was asked for."""
+        if self._filmer:
+            self._filmer.take(policy_params, env_steps)
+
     def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:
         """Begin to save the whole state; and the best policy, if it is a new one. Before the first evaluation is over,
         the best policy is the present one."""
@@ -93,7 +100,7 @@ class Recorder:
         self._writer.close()
         if self._wandb:
             self._wandb.close()
-        plots.plot_run(self._folder.path)
+        plots.plot_run(self._folder)
         self._policies = [(self._algorithm.policy_params(state), {"env_steps": env_steps})]
         best = self._best_policy(state)
         if best:
@@ -122,6 +129,8 @@ class Recorder:
     def wait(self) -> None:
         """Until everything is on the disk."""
         self._saver.wait()
+        if self._filmer:
+            self._filmer.wait()
 
     def _score_in_gymnasium(self, policy_params: Any, num_episodes: int) -> Scores:
         return score_in_gymnasium(self._task, deterministic_act(self._algorithm, policy_params), num_episodes)
@@ -147,6 +156,9 @@ class Follower(Recorder):
         """Nothing: the first process logs."""
 
     def write(self, row: Row) -> None:
+        """Nothing."""
+
+    def film(self, policy_params: Any, env_steps: int) -> None:
         """Nothing."""
 
     def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:

@@ -77,6 +77,7 @@ def test_mistakes_cost_one_line(tmp_path):
         ((), "say which run: run=RUN_DIR, or one of run=zoo:humanoid-csac, "),
         (("run=nowhere",), "no run at 'nowhere'"),
         (("run=zoo:walker2d-sac", f"out={tmp_path}/file/walk.mp4"), f"cannot write {tmp_path}/file/walk.mp4"),
+        (("run=zoo:walker2d-sac", f"html={tmp_path}/file/walk.html"), f"cannot write {tmp_path}/file/walk.html"),
         (("run=zoo:walker2d-sac", "viewer=true"), "viewer=true needs a screen"),
     ):
         done = command("play", *arguments)

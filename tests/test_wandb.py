@@ -7,7 +7,8 @@ import pytest
 from commands import TINY, TINY_CHUNK
 from wandb.proto.wandb_internal_pb2 import Record
 
-import mjx_walk
+import mjx_walk.api
+from mjx_walk.config import load_config, save_config
 from mjx_walk.errors import UserError
 
 
@@ -50,6 +51,15 @@ def test_rows_are_logged_and_a_resumed_run_goes_on_in_the_same_one(tmp_path, mon
     assert list(logged) == [row["env_steps"] for row in run.metrics] and len(logged) == 6
     for row in run.metrics[1:]:
         assert logged[row["env_steps"]]["train/loss"] == pytest.approx(row["train/loss"])
+
+
+def test_a_run_may_be_logged_and_filmed_from_its_resumption_on(tmp_path):
+    config = load_config(["env=walker2d", "hardware=cpu", "algo.discount=0.9"])
+    save_config(config, tmp_path / "config.yaml")
+    wishes = ["wandb_project=walking", "evaluation.films=true", "total_steps=7"]
+    resumed = mjx_walk.api.resolve([f"run_dir={tmp_path}", "resume=true", *wishes])
+    assert resumed.wandb_project == "walking" and resumed.evaluation.films and resumed.total_steps == 7
+    assert resumed.algo == config.algo and resumed.evaluation.num_envs == config.evaluation.num_envs
 
 
 def test_without_the_package_nothing_is_begun(tmp_path, monkeypatch):
