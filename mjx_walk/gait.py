@@ -1,4 +1,4 @@
-"""A gait sheet: what a body does over an episode, on one page."""
+"""A gait sheet: what a body does over an episode, on one page; and a strip of frames."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def draw_gait_sheet(episode: Episode, path: Path) -> Path:
     shown = slice(start, start + round(_SECONDS_SHOWN / episode.seconds_per_step))
     length = f"{len(episode.rewards)} steps ({episode.seconds[-1]:.1f} s)"
     figure.suptitle(f"{episode.env}: return {episode.rewards.sum():,.0f} in {length}")
-    _frames(figure.add_subplot(grid[0, :]), episode, shown)
+    _frames(figure.add_subplot(grid[0, :]), episode, float(episode.seconds[shown.start]))
     height = figure.add_subplot(grid[1, :])
     height.plot(episode.seconds, episode.torso[:, 2])
     height.set_ylabel("torso height (m)")
@@ -44,18 +44,29 @@ def draw_gait_sheet(episode: Episode, path: Path) -> Path:
     return path
 
 
-def _frames(axes, episode: Episode, shown: slice) -> None:
-    """A strip of frames, evenly spaced over the first second shown."""
+def frame_strip(episode: Episode, start: float, seconds: float) -> np.ndarray:
+    """Frames side by side, evenly spaced over a part of a rendered episode, which is cut off at its end.
+
+    Args:
+        episode: with frames.
+        start: of the part, s.
+        seconds: that it lasts.
+
+    Returns:
+        `[height, 8·(width // 3), 3] u8`: the middle third of each.
+    """
+    times = np.linspace(start, start + seconds, _NUM_FRAMES) * episode.frames_per_second
+    chosen = [episode.frames[min(int(time), len(episode.frames) - 1)] for time in times]
+    width = chosen[0].shape[1] // 3
+    return np.concatenate([frame[:, width : 2 * width] for frame in chosen], axis=1)
+
+
+def _frames(axes, episode: Episode, start: float) -> None:
+    """A strip of them over a second."""
     axes.set_axis_off()
-    if not episode.frames:
-        return
-    last = min(shown.start + round(_SECONDS_OF_FRAMES / episode.seconds_per_step), len(episode.rewards)) - 1
-    steps = np.linspace(shown.start, last, _NUM_FRAMES)
-    chosen = [episode.frames[min(int(step) // episode.steps_per_frame, len(episode.frames) - 1)] for step in steps]
-    width = chosen[0].shape[1]
-    middle = slice(width // 3, 2 * width // 3)
-    axes.imshow(np.concatenate([frame[:, middle] for frame in chosen], axis=1))
-    axes.set_title(f"{episode.seconds[shown.start]:.1f} s to {episode.seconds[last]:.1f} s", fontsize=9)
+    if episode.frames:
+        axes.imshow(frame_strip(episode, start, _SECONDS_OF_FRAMES))
+        axes.set_title(f"{start:.1f} s to {start + _SECONDS_OF_FRAMES:.1f} s", fontsize=9)
 
 
 def _contacts(axes, episode: Episode, shown: slice) -> None:

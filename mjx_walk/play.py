@@ -3,11 +3,13 @@
 import dataclasses
 from pathlib import Path
 
+import imageio.v3 as iio
+
 from mjx_walk import cli, run_folder, zoo
 from mjx_walk.api import load_run
 from mjx_walk.episode import record_episode
 from mjx_walk.errors import UserError
-from mjx_walk.gait import draw_gait_sheet
+from mjx_walk.gait import draw_gait_sheet, frame_strip
 from mjx_walk.live_viewer import show
 from mjx_walk.page import require_library, write_page
 from mjx_walk.rendering import write_film
@@ -15,12 +17,13 @@ from mjx_walk.settings import setting
 
 USAGE = """
 usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [seed=0] [width=640] [height=480] [out=FILE.mp4] [html=FILE.html]
-                               [gait=FILE.png] [viewer=true]
+                               [gait=FILE.png] [strip=FILE.png start=5 seconds=1] [viewer=true]
 
   out=FILE.mp4    a film of one episode; written unless something else is asked for, by default RUN_DIR/episode.mp4, or
                   NAME.mp4 here for a policy of the zoo
   html=FILE.html  a page that plays it in 3D in any browser, offline, beside its reward terms (pip install meshcat)
   gait=FILE.png   a gait sheet: frames, torso height and speed, floor contacts, torques, reward terms
+  strip=FILE.png  eight frames side by side, over so many seconds from a start on
   viewer=true     MuJoCo's live viewer, which needs a screen; episodes follow each other until it is closed
 """
 
@@ -31,6 +34,9 @@ class Arguments:
     out: str | None = None
     html: str | None = None
     gait: str | None = None
+    strip: str | None = None
+    start: float = setting(5.0, at_least=0)
+    seconds: float = setting(1.0, above=0)
     viewer: bool = False
     seed: int = setting(0, at_least=0)
     width: int = setting(640, at_least=64)
@@ -46,14 +52,14 @@ def main(arguments: list[str]) -> None:
     film = Path(parsed.out) if parsed.out else None
     if parsed.html:
         require_library()
-    if film is None and not (parsed.html or parsed.gait or parsed.viewer):
+    if film is None and not (parsed.html or parsed.gait or parsed.strip or parsed.viewer):
         film = Path(f"{folder.path.name}.mp4") if zoo.holds(folder.path) else folder.path / "episode.mp4"
-    for path in (film, parsed.html, parsed.gait):
+    for path in (film, parsed.html, parsed.gait, parsed.strip):
         if path:
             cli.check_writable(Path(path))
     run = load_run(parsed.run, "c")
-    if film or parsed.html or parsed.gait:
-        size = (parsed.width, parsed.height) if film or parsed.gait else None
+    if film or parsed.html or parsed.gait or parsed.strip:
+        size = (parsed.width, parsed.height) if film or parsed.gait or parsed.strip else None
         episode = record_episode(run.task, run.policy, parsed.seed, size)
         print(f"{episode.env}: return {episode.rewards.sum():,.1f} in {len(episode.rewards)} steps")
         if film:
@@ -63,6 +69,9 @@ def main(arguments: list[str]) -> None:
             print(write_page(episode, Path(parsed.html)))
         if parsed.gait:
             print(draw_gait_sheet(episode, Path(parsed.gait)))
+        if parsed.strip:
+            iio.imwrite(parsed.strip, frame_strip(episode, parsed.start, parsed.seconds))
+            print(parsed.strip)
     if parsed.viewer:
         show(run.task, run.policy, parsed.seed)
 

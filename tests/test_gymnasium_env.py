@@ -91,3 +91,20 @@ def test_its_keywords_are_gymnasiums():
         == gymnasium.make("Humanoid-v5", include_cfrc_ext_in_observation=False).observation_space.shape
     )
     assert make_env("humanoid", "c").observation_size == 348 > env.observation_space.shape[0]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_stable_baselines3_trains_on_it():
+    """PPO of another library, with its defaults: episodes get longer and better, on Gymnasium's own task, too."""
+    stable_baselines3 = pytest.importorskip("stable_baselines3", reason="pip install stable-baselines3")
+    evaluate_policy = stable_baselines3.common.evaluation.evaluate_policy
+    pytest.importorskip("torch").set_num_threads(1)  # more of them wait for each other beside another test
+    env = gymnasium.make("mjx_walk/Walker2d-v5", physics="c")
+    model = stable_baselines3.PPO("MlpPolicy", env, seed=0, device="cpu", verbose=0)
+    real = stable_baselines3.common.monitor.Monitor(gymnasium.make("Walker2d-v5"))
+    before, _ = evaluate_policy(model, real, n_eval_episodes=10)
+    model.learn(30_000)
+    returns = [episode["r"] for episode in model.ep_info_buffer]
+    after, _ = evaluate_policy(model, real, n_eval_episodes=10)
+    assert np.mean(returns) > 100 and after > before + 100

@@ -64,10 +64,21 @@ def test_an_episode_holds_what_gymnasium_says(run):
 @renders
 @pytest.mark.slow
 def test_gait_sheet(tmp_path):
-    done = command("play", "run=zoo:walker2d-td3", f"gait={tmp_path}/gait.png", "width=240", "height=180")
+    done = command(
+        "play",
+        "run=zoo:walker2d-td3",
+        f"gait={tmp_path}/gait.png",
+        f"strip={tmp_path}/strip.png",
+        "width=240",
+        "height=180",
+    )
     assert done.returncode == 0 and "Walker2d-v5: return 6," in done.stdout, done.stderr
     image = iio.imread(tmp_path / "gait.png")
     assert image.shape[0] > 1000 and image.std() > 20
+    strip = iio.imread(tmp_path / "strip.png")
+    assert strip.shape == (180, 8 * 80, 3)
+    first, last = strip[:, :80].astype(float), strip[:, -80:].astype(float)
+    assert np.abs(first - last).mean() > 5
     assert not list(tmp_path.glob("*.mp4"))
 
 

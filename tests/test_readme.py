@@ -1,15 +1,23 @@
 """What README tells people to type."""
 
 import re
+import shlex
 from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
+from commands import TINY, command
 
+import mjx_walk
+from mjx_walk import zoo
+from mjx_walk.config import load_config
 from mjx_walk.envs import make_env
 
 CLONE = Path(__file__).parent.parent
 README = (CLONE / "README.md").read_text()
+PAGES = {path: path.read_text() for path in (CLONE / "README.md", *sorted((CLONE / "docs").glob("*.md")))}
+RUN_ELSEWHERE = ("bench", "parity")
+"""Commands that tests of their own run, at sizes of their own."""
 
 
 def blocks(language):
@@ -41,6 +49,75 @@ def test_ci_runs_the_very_test_command():
     assert command.endswith(".venv/bin/pytest") and command in (CLONE / ".ci" / "run").read_text().splitlines()
 
 
-def test_files_it_links_to_are_there():
-    for target in re.findall(r"\]\(([^)]+)\)", README):
-        assert target.startswith("http") or (CLONE / target).exists(), target
+def test_files_they_link_to_are_there():
+    for page, text in PAGES.items():
+        for target in re.findall(r"\]\(([^)]+)\)", text):
+            name, _, heading = target.partition("#")
+            assert target.startswith("http") or (page.parent / name).exists(), target
+            if heading:
+                headings = re.findall(r"^#+ (.*)$", (page.parent / name).read_text(), flags=re.MULTILINE)
+                assert heading in {title.lower().replace(" ", "-") for title in headings}
+
+
+def test_own_body(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (own,) = [block for block in blocks("python") if block.startswith("# heavy_torso.py")]
+    Path("heavy_torso.py").write_text(own)
+    name, xml = re.search(r"python heavy_torso\.py && python -m \S+ env=(\w+) env\.xml_file=(\S+?)`", README).groups()
+    exec(compile(own, "heavy_torso.py", "exec"), {})
+    task = make_env(name, physics="c", xml_file=xml)
+    assert task.model.body_mass[1] == pytest.approx(10.0) != make_env(name, physics="c").model.body_mass[1]
+    assert task.gymnasium_kwargs()["xml_file"] == str(tmp_path / xml)
+
+
+def test_commands_of_the_tables_are_recipes():
+    """Those behind the scores, whose recipes are for a GPU."""
+    commands = re.findall(r"\| `(env=[^`]+)` \|$", README, flags=re.MULTILINE)
+    commands += re.findall(r"\| `python -m mjx_walk\.train (env=[^`]+)` \|$", README, flags=re.MULTILINE)
+    assert len(commands) > 25 and zoo.table() in README
+    for line in commands:
+        config = load_config(["hardware=gpu", *line.split()])
+        assert config.total_steps > 1e6 and f"algo={config.algo.name}" in line
+
+
+def all_commands():
+    """All that start a command, in blocks and in sentences; of alternatives the first, and no mere names."""
+    found = set()
+    for text in PAGES.values():
+        fenced = r"```\w*\n(.*?)```"
+        lines = [line for block in re.findall(fenced, text, flags=re.DOTALL) for line in block.splitlines()]
+        lines += re.findall(r"`([^`]+)`", re.sub(fenced, "", text, flags=re.DOTALL))
+        for line in lines:
+            first_of_each = re.sub(r"\|\S*", "", " ".join(line.split()))
+            found |= set(re.findall(r"python -m mjx_walk\.(zoo|\w+ [^&]+\S)", first_of_each))
+    return sorted(line for line in found if not line.startswith(RUN_ELSEWHERE))
+
+
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("readme") / "run"
+    mjx_walk.run([*TINY, f"run_dir={folder}", "total_steps=1", "evaluation.gymnasium_episodes=1"])
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", all_commands())
+def test_every_command(line, small_run, tmp_path, monkeypatch):
+    """As it stands there, but for sizes and places."""
+    monkeypatch.chdir(tmp_path)
+    (own,) = [block for block in blocks("python") if block.startswith("# heavy_torso.py")]
+    exec(compile(own, "heavy_torso.py", "exec"), {})
+    line = re.sub(r" (num_envs=N|viewer=true)", "", line).replace("RUN_DIR", str(small_run))
+    line = re.sub(r"=(PATH|DIR|/shared/humanoid)", f"={tmp_path}/there", line)
+    name, *arguments = shlex.split(line)
+    if "resume=true" in arguments:
+        arguments = [f"run_dir={small_run}", "resume=true"]
+    elif "draw=true" in arguments:
+        arguments = ["draw=true", f"out={small_run.parent}"]
+    elif name == "train" and "--cfg" not in arguments:
+        arguments += ["total_steps=1", "evaluation.gymnasium_episodes=1"]
+    elif name == "compare":
+        arguments = [argument for argument in arguments if not argument.startswith(("seeds=", "total_steps="))]
+        arguments += ["seeds=1", "total_steps=1", "evaluation.gymnasium_episodes=1"]
+    done = command(name, *arguments, timeout=900)
+    assert done.returncode == 0, f"{name} {shlex.join(arguments)}\n{done.stdout}\n{done.stderr}"
