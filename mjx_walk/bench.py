@@ -14,7 +14,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 
-from mjx_walk import cli
+from mjx_walk import cli, profile
 from mjx_walk.algos import ALGORITHMS, make_algorithm
 from mjx_walk.api import make_task, resolve
 from mjx_walk.config import Config, compile_cache_dir
@@ -26,6 +26,7 @@ from mjx_walk.loop import make_chunk, make_init
 from mjx_walk.off_policy import OffPolicyConfig
 from mjx_walk.replay import ReplayBuffer, Steps
 from mjx_walk.settings import setting
+from mjx_walk.types import Algorithm
 
 USAGE = """
 usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [physics=auto] [num_envs=N] [seconds=5] [peers=false]
@@ -79,6 +80,8 @@ def main(arguments: list[str]) -> None:
     for name, value in training_figures(config, task, parsed.seconds).items():
         report(name, value, "s" if name.startswith("compile") else "env-steps/s")
     report("training / Gymnasium on one core", results["training"] / gym_speed, "times")
+    for name, value, unit in where_time_goes(config, task, results["physics only"], parsed.seconds):
+        report(name, value, unit)
     for name, value in peak_memory().items():
         report(name, value, "GiB")
     if issubclass(ALGORITHMS[parsed.algo][1], OffPolicyConfig):
@@ -154,10 +157,7 @@ def step_speed(task: Task, num_envs: int, seconds: float) -> float:
 
 def training_figures(config: Config, task: Task, seconds: float) -> dict[str, float]:
     """Training end to end as the loop runs it, and the compile time of its programs without and with a cache."""
-    settings = config.algo
-    if isinstance(settings, OffPolicyConfig):
-        settings = dataclasses.replace(settings, prefill_steps=0)
-    algorithm = make_algorithm(task, config.num_envs, config.evaluation, settings)
+    algorithm = _learning_at_once(config, task)
     old_cache = compile_cache_dir()
     figures = {}
     with tempfile.TemporaryDirectory() as cache:
@@ -174,6 +174,28 @@ def training_figures(config: Config, task: Task, seconds: float) -> dict[str, fl
     steps_per_chunk = algorithm.steps_per_update * config.updates_per_chunk
     speed = steps_per_second(lambda state: chunk(state)[0], state, steps_per_chunk, seconds)
     return figures | {"training": speed}
+
+
+def _learning_at_once(config: Config, task: Task) -> Algorithm:
+    """The algorithm, which fills no replay before it learns."""
+    settings = config.algo
+    if isinstance(settings, OffPolicyConfig):
+        settings = dataclasses.replace(settings, prefill_steps=0)
+    return make_algorithm(task, config.num_envs, config.evaluation, settings)
+
+
+def where_time_goes(config: Config, task: Task, physics_speed: float, seconds: float) -> list[tuple[str, float, str]]:
+    """Names, values and units: of one update, what collecting and learning take, and the least that each could."""
+    algorithm = _learning_at_once(config, task)
+    parts = profile.time_parts(algorithm, seconds)
+    flops, peak = profile.learning_flops(algorithm), profile.matmul_speed(config.algo.network_dtype, seconds)
+    return [
+        ("an update: collecting", parts["collecting"] * 1e3, "ms"),
+        ("  of which physics alone would take", algorithm.steps_per_update / physics_speed * 1e3, "ms"),
+        ("an update: learning", parts["learning"] * 1e3, "ms"),
+        ("  of which matrix products alone would take", flops / peak * 1e3, "ms"),
+        (f"products of large matrices, {config.algo.network_dtype}", peak / 1e12, "TFLOP/s"),
+    ]
 
 
 def insert_times(task: Task) -> dict[str, float]:

@@ -2,8 +2,12 @@
 
 import json
 
+import jax
+import jax.numpy as jnp
 import pytest
 from commands import command
+
+from mjx_walk.profile import matmul_flops
 
 
 @pytest.mark.parametrize("algo", ["ppo", "td3"])
@@ -15,7 +19,21 @@ def test_bench_measures_and_writes(tmp_path, algo):
     results = content["results"]
     speeds = ("Gymnasium, one core", "physics only", "physics, observation and reward", "training")
     assert all(results[name] > 100 for name in speeds)
+    for part, limit in (("collecting", "physics alone"), ("learning", "matrix products alone")):
+        assert results[f"an update: {part}"] > 0 and results[f"  of which {limit} would take"] > 0
     inserts = [value for name, value in results.items() if name.startswith("insert of 4,096 transitions")]
     assert len(inserts) == (2 if algo == "td3" else 0) and all(value > 0 for value in inserts)
     assert results["compile and first update, cold cache"] > 0 and results["peak memory, host"] > 0.1
     assert content["env"] == "Walker2d-v5" and content["versions"]["mujoco"] and "16 copies" in content["device"]
+
+
+def test_products_are_counted():
+    """By hand: 2·m·k·n each; ten times in a loop; the larger of two branches; twice in the gradient of a vector."""
+    a, b, v = jnp.zeros((3, 5)), jnp.zeros((5, 7)), jnp.zeros(5)
+    assert matmul_flops(lambda a, b: a @ b, a, b) == 2 * 3 * 5 * 7
+    assert matmul_flops(jax.vmap(lambda v, b: v @ b, (0, None)), a, b) == 2 * 3 * 5 * 7
+    loop = jax.jit(lambda a: jax.lax.scan(lambda c, _: (c + a @ b @ b.T, None), a, length=10)[0])
+    assert matmul_flops(loop, a) == 10 * 2 * (2 * 3 * 5 * 7)
+    branch = lambda c: jax.lax.cond(c, lambda: (a @ b)[0, 0], lambda: 0.0)  # noqa: E731
+    assert matmul_flops(branch, True) == 2 * 3 * 5 * 7
+    assert matmul_flops(jax.grad(lambda b: jnp.tanh(v @ b).sum()), b) == 2 * (2 * 5 * 7)

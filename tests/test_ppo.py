@@ -95,7 +95,7 @@ def test_update_equals_brax(monkeypatch):
     assert all(np.isfinite(value) for name, value in metrics.items() if not name.startswith("eval"))
 
 
-@pytest.mark.parametrize("physics", ["jax", "warp", "c"])
+@pytest.mark.parametrize("physics", ["jax", pytest.param("warp", marks=pytest.mark.slow), "c"])
 def test_small_batch_training_learns(physics):
     """Sixteen copies of a walker that is paid for standing learn to stand longer, on every engine."""
     task = make_env("walker2d", physics=physics, forward_reward_weight=0.0)

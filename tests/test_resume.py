@@ -30,7 +30,7 @@ def train(run_dir, *arguments, tiny=TINY):
     return done
 
 
-@pytest.mark.parametrize("physics", ["c", "jax", "warp"])
+@pytest.mark.parametrize("physics", ["c", "jax", pytest.param("warp", marks=pytest.mark.slow)])
 def test_n_and_n_chunks_equal_2n(tmp_path, physics):
     engine = f"physics={physics}"
     train(tmp_path / "whole", engine, f"total_steps={6 * TINY_CHUNK}")
@@ -51,7 +51,9 @@ def test_n_and_n_chunks_equal_2n(tmp_path, physics):
     assert seconds == sorted(seconds)
 
 
-@pytest.mark.parametrize("algo", ["sac", "td3", "ddpg"])
+@pytest.mark.parametrize(
+    "algo", ["sac", pytest.param("td3", marks=pytest.mark.slow), pytest.param("ddpg", marks=pytest.mark.slow)]
+)
 def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
     """The first half ends after the replay has gone round, with truncated episodes in it."""
     train(tmp_path / "whole", f"algo={algo}", f"total_steps={9 * TINY_CHUNK}", tiny=TINY_OFF_POLICY)
@@ -66,7 +68,7 @@ def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
     assert not (tmp_path / "whole" / "checkpoints" / "best" / "replay").exists()
 
 
-@pytest.mark.parametrize("algo", ["a2c", "reinforce"])
+@pytest.mark.parametrize("algo", [pytest.param("a2c", marks=pytest.mark.slow), "reinforce"])
 def test_policy_gradient_resume_is_exact(tmp_path, algo):
     settings = [
         f"algo={algo}",

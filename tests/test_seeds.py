@@ -50,6 +50,7 @@ def test_seeds_side_by_side_are_the_runs_of_each(tmp_path, algo, tiny):
         assert (together["speed/seeds_together"], apart["speed/seeds_together"]) == (2, 1)
 
 
+@pytest.mark.slow
 def test_seeds_side_by_side_resume_exactly_and_each_may_go_on_alone(tmp_path):
     train(tmp_path / "whole", f"total_steps={4 * TINY_CHUNK}", SEEDS)
     train(tmp_path / "halves", f"total_steps={2 * TINY_CHUNK}", SEEDS)

@@ -1,0 +1,90 @@
+"""Where the time of training goes, against what physics alone and the networks' products alone would take."""
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.extend import core
+
+from mjx_walk.loop import make_init
+from mjx_walk.types import Algorithm
+
+
+def time_parts(algorithm: Algorithm, seconds: float) -> dict[str, float]:
+    """Seconds of collecting and of learning in one update, each a program of its own, in turn as in training.
+
+    Args:
+        algorithm: whose replay, if it has one, learns from the first step on.
+        seconds: to measure for.
+    """
+    collect = jax.jit(algorithm.collect, donate_argnums=0)
+    learn = jax.jit(algorithm.learn, donate_argnums=0)
+    state = make_init(algorithm)(jax.random.PRNGKey(0))
+    spent = {"collecting": 0.0, "learning": 0.0}
+    num_updates = -2  # the first two compile
+    while sum(spent.values()) < seconds or num_updates < 1:
+        start = time.monotonic()
+        state, batch = jax.block_until_ready(collect(state))
+        between = time.monotonic()
+        state, _ = jax.block_until_ready(learn(state, batch))
+        if num_updates >= 0:
+            spent["collecting"] += between - start
+            spent["learning"] += time.monotonic() - between
+        num_updates += 1
+    return {name: total / num_updates for name, total in spent.items()}
+
+
+def learning_flops(algorithm: Algorithm) -> float:
+    """Floating-point operations of the matrix products in one update."""
+    state = jax.eval_shape(make_init(algorithm), jax.random.PRNGKey(0))
+    state, batch = jax.eval_shape(algorithm.collect, state)
+    return matmul_flops(algorithm.learn, state, batch)
+
+
+def matmul_flops(function: Callable, *arguments: Any) -> float:
+    """Floating-point operations of the matrix products in one call; of a branch's alternatives the largest counts, and
+    the body of a loop whose length is not known once.
+
+    Args:
+        function: traceable.
+        arguments: arrays or their shapes.
+    """
+    return _count(jax.make_jaxpr(function)(*arguments).jaxpr)
+
+
+def _count(jaxpr: core.Jaxpr) -> float:
+    return sum(_count_equation(equation) for equation in jaxpr.eqns)
+
+
+def _count_equation(equation: core.JaxprEqn) -> float:
+    name, params = equation.primitive.name, equation.params
+    if name == "dot_general":
+        (contracted, _), _ = params["dimension_numbers"]
+        left: Any = equation.invars[0].aval
+        product: Any = equation.outvars[0].aval
+        return 2.0 * math.prod(product.shape) * math.prod(left.shape[axis] for axis in contracted)
+    if name == "cond":
+        return max(_count(branch.jaxpr) for branch in params["branches"])
+    inner = sum(_count(getattr(value, "jaxpr", value)) for value in params.values() if _is_jaxpr(value))
+    return inner * params.get("length", 1) if name == "scan" else inner
+
+
+def _is_jaxpr(value: Any) -> bool:
+    return isinstance(value, core.Jaxpr | core.ClosedJaxpr)
+
+
+def matmul_speed(dtype: str, seconds: float) -> float:
+    """Floating-point operations a second of a large square matrix product on this device, at the precision set."""
+    size = 8192 if jax.default_backend() != "cpu" else 1024
+    matrix = jax.random.normal(jax.random.PRNGKey(0), (size, size), dtype)
+    product = jax.jit(lambda a: (a @ matrix) / size**0.5)
+    result = jax.block_until_ready(product(matrix))
+    start, calls = time.monotonic(), 0
+    while time.monotonic() - start < seconds:
+        for _ in range(10):
+            result = product(result)
+        jax.block_until_ready(result)
+        calls += 10
+    return calls * 2.0 * size**3 / (time.monotonic() - start)
