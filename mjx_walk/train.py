@@ -9,6 +9,7 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from omegaconf import DictConfig, open_dict
 
 from mjx_walk import cli, launch
@@ -82,17 +83,27 @@ def _train_in_team(settings: list[str], team: Team) -> int:
 
 
 def _through_hydra(arguments: list[str]) -> None:
-    """Hand flags to Hydra: sweeps, launchers, `--cfg`."""
+    """Hand flags to Hydra: sweeps, launchers, `--cfg`.
+
+    Raises:
+        UserError: Hydra does not accept them.
+    """
     overrides = [a for a in arguments if not a.startswith("-") and ("=" in a or a[0] in "+~")]
     parsed = OverridesParser.create().parse_overrides(complete_overrides(overrides))
     plain = [o for o in parsed if not o.is_sweep_override() and not o.key_or_group.startswith("hydra")]
     load_config([str(o.input_line) for o in plain])  # says in one line what Hydra would say in many
     # Hydra's parser wants all overrides in one row.
     flags = [argument for argument in arguments if argument not in overrides]
+    if {"-m", "--multirun"} & {*flags} and {"-c", "--cfg", "-i", "--info"} & {*flags}:
+        raise UserError("-m trains a sweep and --cfg prints a configuration: give one of them")
     sys.argv = [sys.argv[0], *flags, str(parsed[0].input_line), *overrides]
     os.environ["HYDRA_FULL_ERROR"] = "1"
     register_schemas()
-    hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")(_sweep_job)()
+    try:
+        hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")(_sweep_job)()
+    except HydraException as error:
+        what, _, _ = str(error).partition("Config search path")
+        raise UserError(" ".join(what.split())) from error
 
 
 def _sweep_job(node: DictConfig) -> None:
