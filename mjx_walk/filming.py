@@ -24,8 +24,8 @@ from mjx_walk.run_folder import RunFolder
 _SIZE = (320, 240)
 _FRAMES_PER_SECOND = 25.0
 _SECONDS_IN_TENSORBOARD = 5.0
-_FRAMES_BETWEEN = 2
-"""Of which one is left out in TensorBoard, whose films are GIFs, and large."""
+_EVERY_NTH_FRAME = 2
+"""Is kept in TensorBoard, whose films are GIFs, and large."""
 
 
 class Filmer:
@@ -69,8 +69,8 @@ def film(folder: Path) -> Path:
     episode = record_episode(run.task, run.policy, size=_SIZE, frame_rate=_FRAMES_PER_SECOND)
     path = folder.with_suffix(".mp4")
     write_film(episode.frames, path, episode.frames_per_second)
-    shown = episode.frames[: round(_SECONDS_IN_TENSORBOARD * episode.frames_per_second) : _FRAMES_BETWEEN]
-    _show_in_tensorboard(folder.parent.parent, int(folder.name), shown, episode.frames_per_second / _FRAMES_BETWEEN)
+    shown = episode.frames[: round(_SECONDS_IN_TENSORBOARD * episode.frames_per_second) : _EVERY_NTH_FRAME]
+    _show_in_tensorboard(folder.parent.parent, int(folder.name), shown, episode.frames_per_second / _EVERY_NTH_FRAME)
     shutil.rmtree(folder)
     return path
 
