@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import operator
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -186,10 +187,16 @@ def _as_saved(config: Config, overrides: list[str]) -> Config:
     if not (config.resume and config.run_dir and given <= {*MAY_DIFFER, "hardware"}):
         return config
     saved = read_config(run_folder.open_existing(config.run_dir).config)
-    anew: dict[str, Any] = {key: getattr(config, key) for key in ("total_steps", "wandb_project") if key in given}
-    if "evaluation.films" in given:
-        anew["evaluation"] = dataclasses.replace(saved.evaluation, films=config.evaluation.films)
-    return dataclasses.replace(saved, run_dir=config.run_dir, resume=True, **anew)
+    for key in given & {*MAY_DIFFER} | {"run_dir", "resume"}:
+        saved = _with_setting(saved, key, operator.attrgetter(key)(config))
+    return saved
+
+
+def _with_setting(settings: Any, key: str, value: Any) -> Any:
+    """The same dataclass with another value at a key such as `evaluation.films`."""
+    name, _, rest = key.partition(".")
+    own = _with_setting(getattr(settings, name), rest, value) if rest else value
+    return dataclasses.replace(settings, **{name: own})
 
 
 def _without_lost_reward(config: Config) -> Config:

@@ -77,10 +77,11 @@ def main(arguments: list[str]) -> None:
         "physics, observation and reward": step_speed,
     }.items():
         report(name, measure(task, config.num_envs, parsed.seconds), "env-steps/s")
-    for name, value in training_figures(config, task, parsed.seconds).items():
+    algorithm = _learning_at_once(config, task)
+    for name, value in training_figures(config, task, algorithm, parsed.seconds).items():
         report(name, value, "s" if name.startswith("compile") else "env-steps/s")
     report("training / Gymnasium on one core", results["training"] / gym_speed, "times")
-    for name, value, unit in where_time_goes(config, task, results["physics only"], parsed.seconds):
+    for name, value, unit in where_time_goes(config, algorithm, results["physics only"], parsed.seconds):
         report(name, value, unit)
     for name, value in peak_memory().items():
         report(name, value, "GiB")
@@ -93,16 +94,6 @@ def main(arguments: list[str]) -> None:
     if parsed.out:
         content = {"env": task.gymnasium_id, "device": device, "results": results, "versions": versions()}
         Path(parsed.out).write_text(json.dumps(content, indent=1))
-
-
-def steps_per_second(advance: Callable[[Any], Any], carry: Any, steps_per_call: int, seconds: float) -> float:
-    """Time repeated calls of `carry → carry`, the first of which compiles and is not counted."""
-    carry = jax.block_until_ready(advance(carry))
-    start, calls = time.monotonic(), 0
-    while time.monotonic() - start < seconds:
-        carry = jax.block_until_ready(advance(carry))
-        calls += 1
-    return calls * steps_per_call / (time.monotonic() - start)
 
 
 def gymnasium_speed(task: Task, seconds: float) -> float:
@@ -140,7 +131,7 @@ def _speed_under_random_actions(
         # The key depends on the last state, so that nothing can be left out.
         return key + jnp.isnan(jnp.concatenate([x.ravel() for x in jax.tree.leaves(state)])).any().astype(key.dtype)
 
-    return steps_per_second(advance, jax.random.PRNGKey(1), num_envs * _STEPS_PER_CALL, seconds)
+    return profile.steps_per_second(advance, jax.random.PRNGKey(1), num_envs * _STEPS_PER_CALL, seconds)
 
 
 def physics_speed(task: Task, num_envs: int, seconds: float) -> float:
@@ -155,9 +146,8 @@ def step_speed(task: Task, num_envs: int, seconds: float) -> float:
     return _speed_under_random_actions(task, num_envs, seconds, lambda state: state, jax.vmap(task.step))
 
 
-def training_figures(config: Config, task: Task, seconds: float) -> dict[str, float]:
+def training_figures(config: Config, task: Task, algorithm: Algorithm, seconds: float) -> dict[str, float]:
     """Training end to end as the loop runs it, and the compile time of its programs without and with a cache."""
-    algorithm = _learning_at_once(config, task)
     old_cache = compile_cache_dir()
     figures = {}
     with tempfile.TemporaryDirectory() as cache:
@@ -172,7 +162,7 @@ def training_figures(config: Config, task: Task, seconds: float) -> dict[str, fl
             figures[name] = time.monotonic() - start
         jax.config.update("jax_compilation_cache_dir", old_cache)
     steps_per_chunk = algorithm.steps_per_update * config.updates_per_chunk
-    speed = steps_per_second(lambda state: chunk(state)[0], state, steps_per_chunk, seconds)
+    speed = profile.steps_per_second(lambda state: chunk(state)[0], state, steps_per_chunk, seconds)
     return figures | {"training": speed}
 
 
@@ -184,9 +174,10 @@ def _learning_at_once(config: Config, task: Task) -> Algorithm:
     return make_algorithm(task, config.num_envs, config.evaluation, settings)
 
 
-def where_time_goes(config: Config, task: Task, physics_speed: float, seconds: float) -> list[tuple[str, float, str]]:
+def where_time_goes(
+    config: Config, algorithm: Algorithm, physics_speed: float, seconds: float
+) -> list[tuple[str, float, str]]:
     """Names, values and units: of one update, what collecting and learning take, and the least that each could."""
-    algorithm = _learning_at_once(config, task)
     parts = profile.time_parts(algorithm, seconds)
     flops, peak = profile.learning_flops(algorithm), profile.matmul_speed(config.algo.network_dtype, seconds)
     return [

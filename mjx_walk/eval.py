@@ -4,7 +4,6 @@ import dataclasses
 
 from mjx_walk import cli, run_folder, zoo
 from mjx_walk.api import load_run
-from mjx_walk.errors import UserError
 from mjx_walk.settings import setting
 
 USAGE = """
@@ -27,10 +26,8 @@ class Arguments:
 def main(arguments: list[str]) -> None:
     """Evaluate and print."""
     parsed = cli.parse(Arguments, arguments, USAGE)
-    if parsed.run is None:
-        raise UserError("say which run: run=RUN_DIR")
     folder = run_folder.open_existing(parsed.run)
-    run = load_run(parsed.run, parsed.physics)
+    run = load_run(folder.path, parsed.physics)
     scores = run.evaluate(parsed.episodes, parsed.backend, parsed.seed)
     if parsed.backend == "gymnasium" and not zoo.holds(folder.path):
         scores.save(folder.gymnasium_scores, env_steps=run.policy_facts["env_steps"])

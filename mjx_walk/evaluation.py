@@ -7,7 +7,6 @@ import os
 import pickle
 import platform
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import jax
 import numpy as np
 
 import mjx_walk
+from mjx_walk.child_process import start_module
 from mjx_walk.envs import Task
 from mjx_walk.rollout import evaluate
 from mjx_walk.types import PolicyFn
@@ -115,14 +115,7 @@ class _Worker:
     """A `gymnasium_worker` process. Not `multiprocessing`, which would import the user's main module again."""
 
     def __init__(self) -> None:
-        paths = os.pathsep.join([str(Path(mjx_walk.__file__).parent.parent), os.environ.get("PYTHONPATH", "")])
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "mjx_walk.gymnasium_worker"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=os.environ | {"PYTHONPATH": paths},
-            start_new_session=True,  # Ctrl-C is for the parent
-        )
+        self._process = start_module("gymnasium_worker", stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
     def send(self, message: Any) -> None:
         assert self._process.stdin

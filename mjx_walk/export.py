@@ -37,8 +37,7 @@ def main(arguments: list[str]) -> None:
         raise UserError("format=onnx needs ONNX: pip install onnx") from error
     folder = run_folder.open_existing(parsed.run)
     run = load_run(parsed.run, "c")
-    path = Path(f"{folder.path.name}.onnx") if zoo.holds(folder.path) else folder.path / "policy.onnx"
-    path = Path(parsed.out) if parsed.out else path
+    path = Path(parsed.out) if parsed.out else folder.product("policy.onnx")
     cli.check_writable(path)
     model = translate(run.act, run.task.observation_size, f"{run.config.env.name}_{run.config.algo.name}")
     onnx.save(model, str(path))

@@ -16,6 +16,7 @@ from tensorboardX.proto.summary_pb2 import Summary
 
 import mjx_walk
 from mjx_walk import checkpoint
+from mjx_walk.child_process import start_module
 from mjx_walk.config import Config, save_config
 from mjx_walk.episode import record_episode
 from mjx_walk.rendering import write_film
@@ -50,12 +51,7 @@ class Filmer:
         save_config(self._config, film.config)
         params = jax.device_get(policy_params)
         checkpoint.save(film.best_policy, params, {"env_steps": env_steps}, as_numpy=True)
-        paths = os.pathsep.join([str(Path(mjx_walk.__file__).parent.parent), os.environ.get("PYTHONPATH", "")])
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "mjx_walk.filming", str(film.path)],
-            env=os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"},
-            start_new_session=True,  # Ctrl-C is for the parent
-        )
+        self._process = start_module("filming", str(film.path), env={"JAX_PLATFORMS": "cpu"})
 
     def wait(self) -> None:
         """Until the last film is finished."""

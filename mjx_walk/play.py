@@ -49,29 +49,29 @@ def main(arguments: list[str]) -> None:
     if parsed.run is None:
         raise UserError(f"say which run: run=RUN_DIR, or one of run={zoo.PREFIX}{f', {zoo.PREFIX}'.join(zoo.names())}")
     folder = run_folder.open_existing(parsed.run)
-    film = Path(parsed.out) if parsed.out else None
     if parsed.html:
         require_library()
-    if film is None and not (parsed.html or parsed.gait or parsed.strip or parsed.viewer):
-        film = Path(f"{folder.path.name}.mp4") if zoo.holds(folder.path) else folder.path / "episode.mp4"
-    for path in (film, parsed.html, parsed.gait, parsed.strip):
-        if path:
-            cli.check_writable(Path(path))
-    run = load_run(parsed.run, "c")
-    if film or parsed.html or parsed.gait or parsed.strip:
-        size = (parsed.width, parsed.height) if film or parsed.gait or parsed.strip else None
+    film, html, gait, strip = (Path(p) if p else None for p in (parsed.out, parsed.html, parsed.gait, parsed.strip))
+    if not (film or html or gait or strip or parsed.viewer):
+        film = folder.product("episode.mp4")
+    asked = [path for path in (film, html, gait, strip) if path]
+    for path in asked:
+        cli.check_writable(path)
+    run = load_run(folder.path, "c")
+    if asked:
+        size = None if asked == [html] else (parsed.width, parsed.height)
         episode = record_episode(run.task, run.policy, parsed.seed, size)
         print(f"{episode.env}: return {episode.rewards.sum():,.1f} in {len(episode.rewards)} steps")
         if film:
             write_film(episode.frames, film, episode.frames_per_second)
             print(film)
-        if parsed.html:
-            print(write_page(episode, Path(parsed.html)))
-        if parsed.gait:
-            print(draw_gait_sheet(episode, Path(parsed.gait)))
-        if parsed.strip:
-            iio.imwrite(parsed.strip, frame_strip(episode, parsed.start, parsed.seconds))
-            print(parsed.strip)
+        if html:
+            print(write_page(episode, html))
+        if gait:
+            print(draw_gait_sheet(episode, gait))
+        if strip:
+            iio.imwrite(strip, frame_strip(episode, parsed.start, parsed.seconds))
+            print(strip)
     if parsed.viewer:
         show(run.task, run.policy, parsed.seed)
 

@@ -28,8 +28,6 @@ class Arguments:
 def main(arguments: list[str]) -> None:
     """Draw, and say what was written."""
     parsed = cli.parse(Arguments, arguments, USAGE)
-    if parsed.run is None:
-        raise UserError("say which run: run=RUN_DIR")
     folder = run_folder.open_existing(parsed.run)
     written = plot_run(folder)
     if not written:

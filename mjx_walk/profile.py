@@ -12,6 +12,16 @@ from mjx_walk.loop import make_init
 from mjx_walk.types import Algorithm
 
 
+def steps_per_second(advance: Callable[[Any], Any], carry: Any, steps_per_call: int, seconds: float) -> float:
+    """Time repeated calls of `carry → carry`, the first of which compiles and is not counted."""
+    carry = jax.block_until_ready(advance(carry))
+    start, calls = time.monotonic(), 0
+    while time.monotonic() - start < seconds:
+        carry = jax.block_until_ready(advance(carry))
+        calls += 1
+    return calls * steps_per_call / (time.monotonic() - start)
+
+
 def time_parts(algorithm: Algorithm, seconds: float) -> dict[str, float]:
     """Seconds of collecting and of learning in one update, each a program of its own, in turn as in training.
 
@@ -79,12 +89,5 @@ def matmul_speed(dtype: str, seconds: float) -> float:
     """Floating-point operations a second of a large square matrix product on this device, at the precision set."""
     size = 8192 if jax.default_backend() != "cpu" else 1024
     matrix = jax.random.normal(jax.random.PRNGKey(0), (size, size), dtype)
-    product = jax.jit(lambda a: (a @ matrix) / size**0.5)
-    result = jax.block_until_ready(product(matrix))
-    start, calls = time.monotonic(), 0
-    while time.monotonic() - start < seconds:
-        for _ in range(10):
-            result = product(result)
-        jax.block_until_ready(result)
-        calls += 10
-    return calls * 2.0 * size**3 / (time.monotonic() - start)
+    product = jax.jit(lambda a: jax.lax.fori_loop(0, 10, lambda _, a: (a @ matrix) / size**0.5, a))
+    return steps_per_second(product, matrix, 10 * 2 * size**3, seconds)

@@ -39,6 +39,10 @@ class RunFolder:
     def gymnasium_scores(self) -> Path:
         return self.path / "eval_gymnasium.json"
 
+    def product(self, name: str) -> Path:
+        """Where a file that is made from the policy goes; of a policy of the zoo here, under the policy's name."""
+        return Path(f"{self.path.name}{Path(name).suffix}") if zoo.holds(self.path) else self.path / name
+
 
 def new_path(config: Config) -> Path:
     """Where a run goes if nothing is said."""
@@ -46,12 +50,14 @@ def new_path(config: Config) -> Path:
     return Path("runs") / f"{config.env.name}_{config.algo.name}" / now
 
 
-def open_existing(path: str | Path) -> RunFolder:
+def open_existing(path: str | Path | None) -> RunFolder:
     """A folder that a run has written, or `zoo:NAME`.
 
     Raises:
-        UserError: there is no run at that path.
+        UserError: none is given, or there is no run at that path.
     """
+    if path is None:
+        raise UserError("say which run: run=RUN_DIR")
     folder = RunFolder(zoo.find(path) if isinstance(path, str) and path.startswith(zoo.PREFIX) else Path(path))
     if not folder.config.is_file():
         raise UserError(f"no run at '{path}': give the folder that holds its config.yaml")

@@ -24,6 +24,12 @@ def blocks(language):
     return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
 
 
+def file(name):
+    """That README shows under its name."""
+    (content,) = [block for block in blocks("python") if block.startswith(f"# {name}\n")]
+    return content
+
+
 def test_python_example(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (example,) = [block for block in blocks("python") if not block.startswith("# ")]
@@ -35,8 +41,7 @@ def test_python_example(tmp_path, monkeypatch, capsys):
 def test_own_reward(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name, keyword = re.search(r"env=(\w+) env\.reward_function=(my_reward\.py:\w+)", README).groups()
-    (own,) = [block for block in blocks("python") if block.startswith("# my_reward.py")]
-    Path("my_reward.py").write_text(own)
+    Path("my_reward.py").write_text(file("my_reward.py"))
     task = make_env(name, physics="c", reward_function=keyword)
     before = task.reset_to(task.init_qpos.at[4].set(-0.6), task.init_qvel)
     after = task.step(before, jnp.zeros(task.action_size))
@@ -61,10 +66,8 @@ def test_files_they_link_to_are_there():
 
 def test_own_body(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (own,) = [block for block in blocks("python") if block.startswith("# heavy_torso.py")]
-    Path("heavy_torso.py").write_text(own)
     name, xml = re.search(r"python heavy_torso\.py && python -m \S+ env=(\w+) env\.xml_file=(\S+?)`", README).groups()
-    exec(compile(own, "heavy_torso.py", "exec"), {})
+    exec(compile(file("heavy_torso.py"), "heavy_torso.py", "exec"), {})
     task = make_env(name, physics="c", xml_file=xml)
     assert task.model.body_mass[1] == pytest.approx(10.0) != make_env(name, physics="c").model.body_mass[1]
     assert task.gymnasium_kwargs()["xml_file"] == str(tmp_path / xml)
@@ -106,8 +109,7 @@ def small_run(tmp_path_factory):
 def test_every_command(line, small_run, tmp_path, monkeypatch):
     """As it stands there, but for sizes and places."""
     monkeypatch.chdir(tmp_path)
-    (own,) = [block for block in blocks("python") if block.startswith("# heavy_torso.py")]
-    exec(compile(own, "heavy_torso.py", "exec"), {})
+    exec(compile(file("heavy_torso.py"), "heavy_torso.py", "exec"), {})
     line = re.sub(r" (num_envs=N|total_steps=N|viewer=true)", "", line).replace("RUN_DIR", str(small_run))
     line = re.sub(r"=(PATH|DIR|/shared/humanoid)", f"={tmp_path}/there", line)
     name, *arguments = shlex.split(line)

@@ -52,7 +52,7 @@ def test_n_and_n_chunks_equal_2n(tmp_path, physics):
 
 
 @pytest.mark.parametrize(
-    "algo", ["sac", pytest.param("td3", marks=pytest.mark.slow), pytest.param("ddpg", marks=pytest.mark.slow)]
+    "algo", ["sac", *(pytest.param(algo, marks=pytest.mark.slow) for algo in ("csac", "td3", "ddpg"))]
 )
 def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
     """The first half ends after the replay has gone round, with truncated episodes in it."""
