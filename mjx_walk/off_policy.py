@@ -16,7 +16,7 @@ from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
 from mjx_walk.replay import Replay, ReplayBuffer, Steps
-from mjx_walk.schedules import anneal, factor
+from mjx_walk.schedules import anneal, anneal_discount, factor
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm, Metrics, PolicyFn, Transition
 from mjx_walk.wrappers import VectorEnv, VectorState
@@ -43,6 +43,8 @@ class OffPolicyConfig:
     """Steps that the same draw of exploration noise is kept for."""
     n_step: int = setting(1, at_least=1)
     discount: float = setting(0.99, at_least=0, at_most=1)
+    final_discount: float | None = setting(None, at_least=0, below=1)
+    """What it becomes over `schedule_steps`: its horizon 1 / (1 - γ) changes by the same factor every step."""
     tau: float = setting(0.005, above=0, at_most=1)
     """How far target networks move at each update of theirs."""
     policy_learning_rate: float = setting(3e-4, above=0)
@@ -78,6 +80,8 @@ class Batch(NamedTuple):
     reward_scale: jax.Array
     rate_factor: jax.Array | float
     """The learning rates' share that is left."""
+    remaining: jax.Array | float
+    """The share of `schedule_steps` that is left."""
 
 
 class Learner(NamedTuple):
@@ -205,17 +209,18 @@ def make_off_policy(
         normalizer = state.normalizer
         if config.normalize_observations:
             normalizer = networks.update_normalizer(normalizer, steps.observation)
+        remaining = anneal(state.updates * float(steps_per_update), config.schedule_steps)
+        discount = anneal_discount(config.discount, config.final_discount, remaining)
         ended = steps.terminated | steps.truncated
-        return_scale = returns.update_return_scale(state.return_scale, steps.reward, ended, config.discount)
+        return_scale = returns.update_return_scale(state.return_scale, steps.reward, ended, discount)
         reward_scale = jnp.float32(config.reward_scale)
         if config.normalize_rewards:
             reward_scale *= returns.reward_multiplier(return_scale, config.return_bound)
-        remaining = anneal(state.updates * float(steps_per_update), config.schedule_steps)
         rate_factor = factor(config.learning_rate_schedule, remaining)
         replay = buffer.insert(state.replay, steps)
 
         def as_batch(transitions: Transition) -> Batch:
-            return Batch(transitions, reward_scale, rate_factor)
+            return Batch(transitions, reward_scale, rate_factor, remaining)
 
         def critic_update(learner_state, inputs):
             transitions, key = inputs
@@ -232,7 +237,7 @@ def make_off_policy(
             # Drawn and normalised in one go, since on a GPU small updates wait for the launch of their kernels.
             sample_key, key = jax.random.split(update_key)
             num_transitions = updates_per_unroll * config.batch_size
-            drawn = buffer.sample(replay, sample_key, num_transitions, config.n_step, config.discount)
+            drawn = buffer.sample(replay, sample_key, num_transitions, config.n_step, discount)
             drawn = drawn._replace(
                 observation=normalize(normalizer, drawn.observation),
                 next_observation=normalize(normalizer, drawn.next_observation),

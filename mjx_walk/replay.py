@@ -119,7 +119,9 @@ class ReplayBuffer:
             rows=replay.rows + steps.reward.shape[0],
         )
 
-    def sample(self, replay: Replay, key: jax.Array, batch_size: int, n_step: int, discount: float) -> Transition:
+    def sample(
+        self, replay: Replay, key: jax.Array, batch_size: int, n_step: int, discount: jax.Array | float
+    ) -> Transition:
         """Draw transitions over up to `n_step` steps, uniformly and with replacement.
 
         Those that began in the newest `n_step` rows wait until the row that they lead to is written.
@@ -132,9 +134,9 @@ class ReplayBuffer:
             discount: γ.
 
         Returns:
-            `[N, …]`: `reward` is the discounted sum up to the episode's end or n steps; `discount` what γ times the
-            value of `next_observation` is still to be multiplied by: 0 where the episode terminated on the way,
-            else γ to the number of further steps.
+            `[N, …]`: `reward` is the discounted sum up to the episode's end or n steps; `discount` what the value of
+            `next_observation` is to be multiplied by: 0 where the episode terminated on the way, else γ to the number
+            of steps.
         """
         row_key, copy_key = jax.random.split(key)
         written = jnp.minimum(replay.rows, self.num_rows)
@@ -151,7 +153,7 @@ class ReplayBuffer:
             observation=replay.observation[first, copy].astype(jnp.float32),
             action=replay.action[first, copy],
             reward=reward,
-            discount=jnp.where(end == _TERMINATED, 0.0, discount ** (length - 1.0)),
+            discount=jnp.where(end == _TERMINATED, 0.0, discount**length),
             next_observation=replay.observation[next_row, copy].astype(jnp.float32),
             extras={"state_extras": {"truncation": jnp.zeros(batch_size)}},
         )

@@ -27,7 +27,7 @@ def bootstrap_truncated(
     return reward + jnp.where(truncated, discount * next_value / reward_scale, 0.0)
 
 
-def n_step_return(reward: jax.Array, ended: jax.Array, discount: float) -> tuple[jax.Array, jax.Array]:
+def n_step_return(reward: jax.Array, ended: jax.Array, discount: jax.Array | float) -> tuple[jax.Array, jax.Array]:
     """Discounted rewards up to the end of the episode, or over all n steps.
 
     Args:
@@ -92,7 +92,9 @@ def init_return_scale(num_envs: int) -> ReturnScale:
     return ReturnScale(jnp.zeros(num_envs), jnp.float32(1e-4), jnp.float32(0.0), jnp.float32(1.0), jnp.float32(0.0))
 
 
-def update_return_scale(scale: ReturnScale, reward: jax.Array, done: jax.Array, discount: float) -> ReturnScale:
+def update_return_scale(
+    scale: ReturnScale, reward: jax.Array, done: jax.Array, discount: jax.Array | float
+) -> ReturnScale:
     """Take a chronological `[T, B]` block of rewards, on each device its own, into the running variance."""
 
     def advance(running, inputs):

@@ -9,6 +9,13 @@ def anneal(steps: jax.Array, horizon: int) -> jax.Array:
     return jnp.clip(1.0 - steps / horizon, 0.0, 1.0)
 
 
+def anneal_discount(first: float, last: float | None, remaining: jax.Array) -> jax.Array | float:
+    """A discount whose horizon 1 / (1 - γ) goes from the first's to the last's, geometrically; none: it stays."""
+    if last is None:
+        return first
+    return 1.0 - (1.0 - first) ** remaining * (1.0 - last) ** (1.0 - remaining)
+
+
 def adapt_rate(rate: jax.Array, kl: jax.Array, target: float) -> jax.Array:
     """The learning rate that holds the policy's KL from the one that acted near a target.
 

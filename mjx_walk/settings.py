@@ -13,10 +13,11 @@ def setting(
     above: float | None = None,
     at_least: float | None = None,
     at_most: float | None = None,
+    below: float | None = None,
     choices: tuple[str, ...] | None = None,
 ) -> Any:
     """A dataclass field with a default and the range that `validate` holds it to; for a tuple, each of its items."""
-    limits = {"above": above, "at_least": at_least, "at_most": at_most, "choices": choices}
+    limits = {"above": above, "at_least": at_least, "at_most": at_most, "below": below, "choices": choices}
     return dataclasses.field(default=default, metadata={k: v for k, v in limits.items() if v is not None})
 
 
@@ -49,6 +50,8 @@ def _problem(value: Any, limits: Any) -> str | None:
         return f"must be at least {limits['at_least']}"
     if "at_most" in limits and not value <= limits["at_most"]:
         return f"must be at most {limits['at_most']}"
+    if "below" in limits and not value < limits["below"]:
+        return f"must be below {limits['below']}"
     if "choices" in limits and value not in limits["choices"]:
         return f"choose one of: {', '.join(limits['choices'])}"
     if ("above" in limits or "at_least" in limits) and isinstance(value, float) and math.isinf(value):

@@ -12,9 +12,7 @@ from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.off_policy import Batch
 from mjx_walk.types import Transition
 
-CONFIG = CSACConfig(
-    policy_hidden_layer_sizes=(16,), critic_hidden_layer_sizes=(16,), num_atoms=21, return_bound=2.0, discount=0.9
-)
+CONFIG = CSACConfig(policy_hidden_layer_sizes=(16,), critic_hidden_layer_sizes=(16,), num_atoms=21, return_bound=2.0)
 
 
 def project_slowly(probs, positions, atoms):
@@ -57,9 +55,9 @@ def test_critic_loss_is_the_cross_entropy_to_the_lower_critics_future():
     obs, next_obs = jax.random.normal(keys[0], (2, 64, task.observation_size))
     action = jax.random.uniform(keys[1], (64, task.action_size), minval=-1.0)
     reward = jax.random.normal(keys[2], (64,))
-    discount = jax.random.bernoulli(keys[3], 0.7, (64,)).astype(jnp.float32)
+    discount = 0.9 * jax.random.bernoulli(keys[3], 0.7, (64,)).astype(jnp.float32)
     data = Transition(obs, action, reward, discount, next_obs)
-    _, metrics = learner.critic_update(state, Batch(data, jnp.float32(0.5), 1.0), keys[4])
+    _, metrics = learner.critic_update(state, Batch(data, jnp.float32(0.5), 1.0, 1.0), keys[4])
 
     nets, log_distributions, atoms = make_csac_networks(task, CONFIG)
     distribution = nets.parametric_action_distribution
@@ -71,7 +69,7 @@ def test_critic_loss_is_the_cross_entropy_to_the_lower_critics_future():
     assert 0 < (means[:, 0] < means[:, 1]).sum() < 64
     lower = np.where((means[:, 0] < means[:, 1])[:, None], both[:, 0], both[:, 1])
     future = np.asarray(atoms)[None] + np.asarray(entropy_bonus)[:, None]
-    positions = 0.5 * np.asarray(reward)[:, None] + 0.9 * np.asarray(discount)[:, None] * future
+    positions = 0.5 * np.asarray(reward)[:, None] + np.asarray(discount)[:, None] * future
     target = project_slowly(lower, positions, np.asarray(atoms))
     logs = np.asarray(log_distributions(state.critic, obs, action))
     expected = -(target[:, None] * logs).sum(axis=-1).mean(axis=0).sum()

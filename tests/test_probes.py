@@ -80,11 +80,11 @@ def values(name, task, config, state, obs):
 
 
 @functools.cache
-def trained(name, task_class, max_episode_steps=10):
+def trained(name, task_class, max_episode_steps=10, **changes):
     """Value and action at a few observations after training."""
     task = task_class(max_episode_steps)
     make, config_class = ALGORITHMS[name]
-    config = config_class(**SETTINGS[name])
+    config = config_class(**SETTINGS[name] | changes)
     algorithm = make(task, 32, EvaluationConfig(1), config)
     state = make_init(algorithm)(jax.random.PRNGKey(0))
     state, metrics = make_chunk(algorithm, UPDATES[name], fused=True)(state)
@@ -113,6 +113,27 @@ def test_reward_seen_in_the_observation(name):
 def test_discounting(name):
     value = trained(name, toy_tasks.DelayedReward)[0]
     assert value[[1, 2]] == pytest.approx([DISCOUNT, 1.0], abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["csac", "sac", "td3"])
+def test_a_discount_that_changes(name):
+    """The horizon grows from 2 steps to 8 during the first half of the training."""
+    value = trained(name, toy_tasks.DelayedReward, final_discount=0.875, schedule_steps=200 * 32)[0]
+    assert value[[1, 2]] == pytest.approx([0.875, 1.0], abs=0.05)
+
+
+def test_an_entropy_that_changes():
+    make, config_class = ALGORITHMS["sac"]
+    changes = {"target_entropy": 0.3, "final_target_entropy": -1.0, "schedule_steps": 300 * 32}
+    config = config_class(**OFF_POLICY | changes | {"init_alpha": 0.1, "alpha_learning_rate": 3e-3})
+    task = toy_tasks.RewardedAction(10)
+    algorithm = make(task, 32, EvaluationConfig(1), config)
+    state, _ = make_chunk(algorithm, 2100, fused=True)(make_init(algorithm)(jax.random.PRNGKey(0)))
+    nets = networks.make_sac_networks(task, config)
+    logits = nets.policy_network.apply(None, state.learner.policy, jnp.zeros((10_000, 1)))
+    raw_action = nets.parametric_action_distribution.sample_no_postprocessing(logits, jax.random.PRNGKey(1))
+    entropy = -nets.parametric_action_distribution.log_prob(logits, raw_action).mean()
+    assert float(entropy) == pytest.approx(-1.0, abs=0.15)
 
 
 @with_values

@@ -82,7 +82,7 @@ def test_samples_are_true_transitions_at_any_fill(limit, n_step):
             if terminated[last, b]:
                 assert drawn.discount[i] == 0.0
             else:
-                assert drawn.discount[i] == pytest.approx(discount ** (last - t))
+                assert drawn.discount[i] == pytest.approx(discount ** (last - t + 1))
                 assert tuple(drawn.next_observation[i]) == tuple(next_obs[last, b])
                 num_truncated += truncated[last, b]
     assert num_truncated > (0 if limit < 50 else -1)

@@ -14,7 +14,6 @@ from mjx_walk.types import Transition
 LINEAR = {
     "policy_hidden_layer_sizes": (),
     "critic_hidden_layer_sizes": (),
-    "discount": 0.9,
     "tau": 0.25,
     "policy_learning_rate": 0.01,
     "critic_learning_rate": 0.1,
@@ -31,9 +30,10 @@ def batch():
     """Two transitions from observation 0 to 1, under action 0.25; the second one terminates."""
     obs = jnp.float32([[0.0], [0.0]])
     return Batch(
-        transitions=Transition(obs, obs + 0.25, jnp.float32([3.0, 3.0]), jnp.float32([0.5, 0.0]), obs + 1.0),
+        transitions=Transition(obs, obs + 0.25, jnp.float32([3.0, 3.0]), jnp.float32([0.45, 0.0]), obs + 1.0),
         reward_scale=jnp.float32(2.0),
         rate_factor=1.0,
+        remaining=1.0,
     )
 
 
@@ -52,7 +52,7 @@ def make(config, num_critics, *smoothing):
 
 def test_td3_critic_update(loud_noise):
     """Target action: tanh(0) + clip(0.2 · 4, ±0.5) = 0.5. Targets' values there: 1 + 2 · 0.5 = 2 and 1 − 2 · 0.5 + 1
-    = 1, of which 1 counts. So y = 2 · 3 + 0.5 · 0.9 · 1 = 6.45 and, terminated, 6."""
+    = 1, of which 1 counts. So y = 2 · 3 + 0.45 · 1 = 6.45 and, terminated, 6."""
     learner, state = make(TD3Config(**LINEAR), 2, 0.2, 0.5)
     state = state.replace(
         critic=critic((0.0, 2.0, 0.0), (0.0, 0.0, 1.0)), target_critic=critic((1.0, 2.0, 0.0), (1.0, -2.0, 1.0))

@@ -83,7 +83,7 @@ def make_csac_learner(task: Task, config: CSACConfig) -> Learner:
             lower = (both @ atoms).argmin(axis=-1)
             next_probs = jnp.take_along_axis(both, lower[:, None, None], axis=1)[:, 0]
             soft = atoms - (alpha * log_prob)[:, None]
-            future = data.discount[:, None] * config.discount * soft
+            future = data.discount[:, None] * soft
             target = project(next_probs, (data.reward * reward_scale)[:, None] + future, atoms)
             log_probs = log_distributions(critic, data.observation, data.action)
             return -(target[:, None] * log_probs).sum(axis=(-2, -1)).mean()

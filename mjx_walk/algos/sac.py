@@ -1,7 +1,6 @@
 """Soft actor-critic (Haarnoja et al. 2018) on Brax's networks and losses."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -34,6 +33,8 @@ class SACConfig(OffPolicyConfig):
     alpha_learning_rate: float = setting(3e-4, above=0)
     target_entropy: float = -0.5
     """That the temperature keeps the policy at, in nats per action dimension; Brax's is -0.5."""
+    final_target_entropy: float | None = None
+    """What it becomes, linearly over `schedule_steps`."""
 
 
 class SACState(flax.struct.PyTreeNode):
@@ -68,9 +69,14 @@ def make_sac_learner(
     """
     nets = nets or networks.make_sac_networks(task, config)
     optimizer = make_adam(config.max_grad_norm)
-    # Brax's only use of the size is a target entropy of -0.5 nats for each action dimension.
-    entropy_size = -2.0 * config.target_entropy * task.action_size
-    losses = functools.partial(sac_losses.make_losses, nets, discounting=config.discount, action_size=entropy_size)
+    last_entropy = config.target_entropy if config.final_target_entropy is None else config.final_target_entropy
+
+    def losses(batch: Batch):
+        entropy = last_entropy + (config.target_entropy - last_entropy) * batch.remaining
+        # Brax's only use of the size is a target entropy of -0.5 nats for each action dimension.
+        entropy_size = -2.0 * entropy * task.action_size
+        # γ is in the batch's discounts.
+        return sac_losses.make_losses(nets, batch.reward_scale, discounting=1.0, action_size=entropy_size)
 
     def init(key: jax.Array) -> SACState:
         policy_key, critic_key = jax.random.split(key)
@@ -92,7 +98,7 @@ def make_sac_learner(
         return distribution.mode(logits) if deterministic else distribution.sample(logits, key)
 
     def critic_update(state: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, Metrics]:
-        _, critic_loss, _ = losses(reward_scaling=batch.reward_scale)
+        _, critic_loss, _ = losses(batch)
         if make_critic_loss:
             critic_loss = make_critic_loss(batch.reward_scale)
         loss, grads = jax.value_and_grad(critic_loss)(
@@ -115,7 +121,7 @@ def make_sac_learner(
 
     def full_update(state: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, Metrics]:
         alpha_key, critic_key, policy_key = jax.random.split(key, 3)
-        alpha_loss, _, policy_loss = losses(reward_scaling=batch.reward_scale)
+        alpha_loss, _, policy_loss = losses(batch)
         alpha_grad = jax.grad(alpha_loss)(state.log_alpha, state.policy, None, batch.transitions, alpha_key)
         loss, grads = jax.value_and_grad(policy_loss)(
             state.policy, None, state.critic, jnp.exp(state.log_alpha), batch.transitions, policy_key

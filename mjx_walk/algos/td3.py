@@ -100,7 +100,7 @@ def make_deterministic_learner(
         smoothing = target_noise * jax.random.normal(key, action.shape)
         action = jnp.clip(action + jnp.clip(smoothing, -target_noise_clip, target_noise_clip), -1.0, 1.0)
         values = critic_network.apply(None, state.target_critic, data.next_observation, action)
-        return data.reward * batch.reward_scale + data.discount * config.discount * values.min(axis=-1)
+        return data.reward * batch.reward_scale + data.discount * values.min(axis=-1)
 
     def critic_loss(critic: Any, target: jax.Array, batch: Batch) -> tuple[jax.Array, jax.Array]:
         data = batch.transitions
