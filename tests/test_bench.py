@@ -10,7 +10,7 @@ from commands import command
 from mjx_walk.profile import matmul_flops
 
 
-@pytest.mark.parametrize("algo", ["ppo", "td3"])
+@pytest.mark.parametrize("algo", ["ppo", pytest.param("td3", marks=pytest.mark.slow)])
 def test_bench_measures_and_writes(tmp_path, algo):
     arguments = ("env=walker2d", f"algo={algo}", "num_envs=16", "seconds=0.5", f"out={tmp_path}/bench.json")
     done = command("bench", *arguments)

@@ -57,7 +57,7 @@ def test_there_is_one_time_limit():
         gymnasium.make("mjx_walk/Walker2d-v5", physics="c").unwrapped.step(np.zeros(6))
 
 
-@pytest.mark.parametrize("physics", ["c", "jax"])
+@pytest.mark.parametrize("physics", ["c", pytest.param("jax", marks=pytest.mark.slow)])
 def test_many_side_by_side(physics):
     """Copies that fall, and copies that meet the limit, begin again at once; what they saw last is in `final_obs`."""
     envs = gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=6, physics=physics, max_episode_steps=20)

@@ -30,6 +30,7 @@ def file(name):
     return content
 
 
+@pytest.mark.slow
 def test_python_example(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (example,) = [block for block in blocks("python") if not block.startswith("# ")]

@@ -30,7 +30,7 @@ def train(run_dir, *arguments, tiny=TINY):
     return done
 
 
-@pytest.mark.parametrize("physics", ["c", "jax", pytest.param("warp", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("physics", ["c", *(pytest.param(name, marks=pytest.mark.slow) for name in ("jax", "warp"))])
 def test_n_and_n_chunks_equal_2n(tmp_path, physics):
     engine = f"physics={physics}"
     train(tmp_path / "whole", engine, f"total_steps={6 * TINY_CHUNK}")
@@ -68,7 +68,8 @@ def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
     assert not (tmp_path / "whole" / "checkpoints" / "best" / "replay").exists()
 
 
-@pytest.mark.parametrize("algo", [pytest.param("a2c", marks=pytest.mark.slow), "reinforce"])
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", ["a2c", "reinforce"])
 def test_policy_gradient_resume_is_exact(tmp_path, algo):
     settings = [
         f"algo={algo}",
@@ -85,6 +86,7 @@ def test_policy_gradient_resume_is_exact(tmp_path, algo):
         np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_replay_that_is_gone_is_filled_again(tmp_path):
     train(tmp_path / "run", "algo=sac", f"total_steps={6 * TINY_CHUNK}", tiny=TINY_OFF_POLICY)
     flip_a_byte(checkpoint.step_path(tmp_path / "run" / "checkpoints", 6 * TINY_CHUNK))
@@ -110,7 +112,7 @@ def test_a_damaged_checkpoint_costs_only_its_own_chunks(tmp_path):
     assert [row["env_steps"] for row in rows] == [i * TINY_CHUNK for i in range(1, 7)]
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGUSR1"])
+@pytest.mark.parametrize("name", ["SIGINT", *(pytest.param(x, marks=pytest.mark.slow) for x in ("SIGTERM", "SIGUSR1"))])
 def test_signals_finish_the_chunk_save_and_say_how_to_go_on(tmp_path, name):
     run_dir = tmp_path / "run"
     arguments = [sys.executable, "-m", "mjx_walk.train", *TINY, f"run_dir={run_dir}", "total_steps=100000000"]

@@ -31,7 +31,9 @@ def moved(run_dir):
     return np.concatenate([np.ravel(after[name] - before[name]) for name in names])
 
 
-@pytest.mark.parametrize(("algo", "tiny"), [("ppo", TINY), ("sac", TINY_OFF_POLICY)])
+@pytest.mark.parametrize(
+    ("algo", "tiny"), [("ppo", TINY), pytest.param("sac", TINY_OFF_POLICY, marks=pytest.mark.slow)]
+)
 def test_seeds_side_by_side_are_the_runs_of_each(tmp_path, algo, tiny):
     settings = [f"algo={algo}", f"total_steps={2 * TINY_CHUNK}", "checkpoint.every_chunks=1"]
     tiny = [setting for setting in tiny if "every_chunks" not in setting]
