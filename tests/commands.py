@@ -1,9 +1,12 @@
 """Run the commands as a user does, small."""
 
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 TINY = (
     "env=walker2d",
@@ -49,3 +52,13 @@ def command(module: str, *arguments: str, **kwargs) -> subprocess.CompletedProce
         check=False,
         **kwargs,
     )
+
+
+def command_here(module: str, *arguments: str) -> int:
+    """The same in this process, whose imports and programs are there already; the exit code."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(sys, "argv", [f"mjx_walk.{module}", *arguments])
+        patched.delitem(sys.modules, f"mjx_walk.{module}", raising=False)  # else runpy warns
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_module(f"mjx_walk.{module}", run_name="__main__", alter_sys=True)
+    return ended.value.code

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 import yaml
-from commands import TINY, TINY_CHUNK, command
+from commands import TINY, TINY_CHUNK, command, command_here
 
 from mjx_walk import api, run_folder
 from mjx_walk import eval as eval_command
@@ -85,11 +85,22 @@ def test_eval_names_the_mistake(arguments, says):
 
 
 def test_a_command_prints_one_line_and_exits_with_2(tmp_path):
-    for module, argument in (("train", "env=ant"), ("eval", "run=nowhere"), ("bench", "env=ant"), ("parity", "x=1")):
-        done = command(module, argument, cwd=tmp_path)
-        assert done.returncode == 2
-        lines = [line for line in done.stderr.splitlines() if line]
-        assert len(lines) == 1 and lines[0].startswith("error: "), done.stderr
+    done = command("train", "env=ant", cwd=tmp_path)
+    assert done.returncode == 2
+    lines = [line for line in done.stderr.splitlines() if line]
+    assert len(lines) == 1 and lines[0].startswith("error: "), done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "argument"),
+    [("eval", "run=nowhere"), ("bench", "env=ant"), ("parity", "x=1"), ("compare", "seeds=0"), ("plots", "x=1")],
+)
+def test_so_do_the_others(module, argument, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert command_here(module, argument) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
     assert list(tmp_path.iterdir()) == []
 
 

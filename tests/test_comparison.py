@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from commands import ENVIRONMENT, command
+from commands import ENVIRONMENT, command, command_here
 
 from mjx_walk import cells, comparison
 from mjx_walk import compare as compare_command
@@ -124,15 +124,17 @@ def test_intervals_from_five_seeds_up():
     np.testing.assert_allclose(high - values.mean(0), 0.62, atol=0.15)
 
 
-def test_compare_runs_what_is_missing_and_keeps_the_rest(tmp_path):
+@pytest.mark.slow
+def test_compare_runs_what_is_missing_and_keeps_the_rest(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
     arguments = ("seeds=1", "out=out", *SMALL)
-    done = command("compare", "algos=[ppo]", *arguments, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "1 runs, 0 of them finished before" in done.stdout and "| ppo | 1 |" in done.stdout
+    assert command_here("compare", "algos=[ppo]", *arguments) == 0
+    printed = capfd.readouterr().out
+    assert "1 runs, 0 of them finished before" in printed and "| ppo | 1 |" in printed
     before = (tmp_path / "out" / "ppo" / "seed_0" / "metrics.jsonl").stat().st_mtime_ns
-    again = command("compare", "algos=[ppo,a2c]", *arguments, cwd=tmp_path)
-    assert again.returncode == 0, again.stderr
-    assert "2 runs, 1 of them finished before" in again.stdout and "| a2c | 1 |" in again.stdout
+    assert command_here("compare", "algos=[ppo,a2c]", *arguments) == 0
+    printed = capfd.readouterr().out
+    assert "2 runs, 1 of them finished before" in printed and "| a2c | 1 |" in printed
     assert (tmp_path / "out" / "ppo" / "seed_0" / "metrics.jsonl").stat().st_mtime_ns == before
 
 
@@ -248,9 +250,10 @@ def test_a_second_comparison_in_the_same_folder_waits_its_turn(tmp_path):
     assert cells.run([], [None], tmp_path / "out" / "logs", lambda cell, log: None) is None
 
 
-def test_a_run_that_fails_is_named(tmp_path):
-    done = command("compare", "algos=[ppo]", "seeds=1", "out=out", *SMALL, "num_envs=7", cwd=tmp_path)
-    assert done.returncode == 2 and "not finished: ppo/seed_0" in done.stderr
+def test_a_run_that_fails_is_named(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    assert command_here("compare", "algos=[ppo]", "seeds=1", "out=out", *SMALL, "num_envs=7") == 2
+    assert "not finished: ppo/seed_0" in capfd.readouterr().err
     assert "choose num_envs a multiple of" in (tmp_path / "out" / "logs" / "ppo" / "seed_0.txt").read_text()
 
 

@@ -115,8 +115,7 @@ def test_small_batch_training_learns(physics):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"distribution": "normal"},
-        {"learning_rate_schedule": "adaptive_kl", "normalize_rewards": True},
+        {"distribution": "normal", "learning_rate_schedule": "adaptive_kl", "normalize_rewards": True},
         {"max_value_grad_norm": 0.5, "entropy_schedule": "linear", "learning_rate_schedule": "linear"},
     ],
 )

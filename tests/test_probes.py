@@ -16,6 +16,9 @@ from mjx_walk.algos.csac import make_csac_networks
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.loop import make_chunk, make_init
 
+# A chunk that is vmapped cannot reuse its input's memory.
+pytestmark = pytest.mark.filterwarnings("ignore:Some donated buffers")
+
 DISCOUNT = 0.5
 SMALL = {"policy_hidden_layer_sizes": (32, 32), "discount": DISCOUNT, "reward_scale": 1.0}
 OFF_POLICY = SMALL | {
@@ -79,10 +82,8 @@ def values(name, task, config, state, obs):
     return critics.apply(None, state.learner.critic, obs, action).min(axis=-1)
 
 
-@functools.cache
-def trained(name, task_class, max_episode_steps=10, **changes):
-    """Value and action at a few observations after training."""
-    task = task_class(max_episode_steps)
+def train(name, task, **changes):
+    """Value and action at a few observations after training, and whether the numbers were sound."""
     make, config_class = ALGORITHMS[name]
     config = config_class(**SETTINGS[name] | changes)
     algorithm = make(task, 32, EvaluationConfig(1), config)
@@ -90,8 +91,21 @@ def trained(name, task_class, max_episode_steps=10, **changes):
     state, metrics = make_chunk(algorithm, UPDATES[name], fused=True)(state)
     obs = jnp.float32([[-1.0], [0.0], [1.0]])
     action = algorithm.policy(algorithm.policy_params(state), deterministic=True)(obs, jax.random.PRNGKey(0))
-    assert np.isfinite(metrics["episodes"]).all()
-    return np.asarray(values(name, task, config, state, obs)), np.asarray(action)[:, 0]
+    return values(name, task, config, state, obs), action[:, 0], jnp.isfinite(metrics["episodes"]).all()
+
+
+@functools.cache
+def trained_on_all(name):
+    """Compiled once, which is what takes long here."""
+    indices = jnp.arange(len(toy_tasks.OneOf.TASKS))
+    found = jax.vmap(lambda index: train(name, toy_tasks.OneOf(index)))(indices)
+    value, action, sound = jax.tree.map(np.asarray, found)
+    assert sound.all()
+    return dict(zip(toy_tasks.OneOf.TASKS, zip(value, action, strict=True), strict=True))
+
+
+def trained(name, task_class):
+    return trained_on_all(name)[task_class]
 
 
 algorithms = pytest.mark.parametrize("name", list(SETTINGS))
@@ -118,8 +132,8 @@ def test_discounting(name):
 @pytest.mark.parametrize("name", ["csac", "sac", "td3"])
 def test_a_discount_that_changes(name):
     """The horizon grows from 2 steps to 8 during the first half of the training."""
-    value = trained(name, toy_tasks.DelayedReward, final_discount=0.875, schedule_steps=200 * 32)[0]
-    assert value[[1, 2]] == pytest.approx([0.875, 1.0], abs=0.05)
+    value, _, _ = train(name, toy_tasks.DelayedReward(), final_discount=0.875, schedule_steps=200 * 32)
+    assert np.asarray(value)[[1, 2]] == pytest.approx([0.875, 1.0], abs=0.05)
 
 
 def test_an_entropy_that_changes():
@@ -138,7 +152,7 @@ def test_an_entropy_that_changes():
 
 @with_values
 def test_a_time_limit_does_not_end_the_future(name):
-    value = trained(name, toy_tasks.EndlessReward, 3)[0]
+    value = trained(name, toy_tasks.EndlessReward)[0]
     assert value[1] == pytest.approx(1.0 / (1.0 - DISCOUNT), abs=0.1)
 
 

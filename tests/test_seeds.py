@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from commands import TINY, TINY_CHUNK, TINY_OFF_POLICY
-from test_resume import leaves, train
+from test_resume import leaves, train, train_here
 
 from mjx_walk import train as train_command
 from mjx_walk.config import load_config, save_config
@@ -37,8 +37,8 @@ def moved(run_dir):
 def test_seeds_side_by_side_are_the_runs_of_each(tmp_path, algo, tiny):
     settings = [f"algo={algo}", f"total_steps={2 * TINY_CHUNK}", "checkpoint.every_chunks=1"]
     tiny = [setting for setting in tiny if "every_chunks" not in setting]
-    train(tmp_path / "both", *settings, SEEDS, tiny=tiny)
-    train(tmp_path / "alone", *settings, "seed=5", tiny=tiny)
+    train_here(tmp_path / "both", *settings, SEEDS, tiny=tiny)
+    train_here(tmp_path / "alone", *settings, "seed=5", tiny=tiny)
     assert_alike(leaves(tmp_path / "both" / "seed_5", 2), leaves(tmp_path / "alone", 2), exactly=False)
     one, other, alone = (moved(tmp_path / name) for name in ("both/seed_5", "both/seed_3", "alone"))
     assert np.linalg.norm(one - alone) < 0.3 * np.linalg.norm(alone) < np.linalg.norm(other - alone)
@@ -54,14 +54,14 @@ def test_seeds_side_by_side_are_the_runs_of_each(tmp_path, algo, tiny):
 
 @pytest.mark.slow
 def test_seeds_side_by_side_resume_exactly_and_each_may_go_on_alone(tmp_path):
-    train(tmp_path / "whole", f"total_steps={4 * TINY_CHUNK}", SEEDS)
-    train(tmp_path / "halves", f"total_steps={2 * TINY_CHUNK}", SEEDS)
+    train_here(tmp_path / "whole", f"total_steps={4 * TINY_CHUNK}", SEEDS)
+    train_here(tmp_path / "halves", f"total_steps={2 * TINY_CHUNK}", SEEDS)
     further = (f"total_steps={4 * TINY_CHUNK}", "resume=true")
     train(tmp_path / "halves", *further, SEEDS, tiny=[])
     for seed in (3, 5):
         whole, halves = (leaves(tmp_path / name / f"seed_{seed}", 4) for name in ("whole", "halves"))
         assert_alike(whole, halves, exactly=True)
-    train(tmp_path / "one", f"total_steps={2 * TINY_CHUNK}", SEEDS)
+    train_here(tmp_path / "one", f"total_steps={2 * TINY_CHUNK}", SEEDS)
     train(tmp_path / "one" / "seed_5", *further, tiny=[])
     assert_alike(leaves(tmp_path / "whole" / "seed_5", 4), leaves(tmp_path / "one" / "seed_5", 4), exactly=False)
     with pytest.raises(AssertionError, match=r"differ in total_steps \(was 128, now 256\); resume each alone"):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import TINY, TINY_CHUNK, command
+from commands import TINY, TINY_CHUNK, command_here
 from tensorboardX.proto.event_pb2 import Event
 
 import mjx_walk
@@ -99,10 +99,10 @@ def test_a_loaded_policy_scores_alike_in_its_engine_and_in_gymnasium(finished):
     assert abs(sim.mean - real.mean) < max(4 * error, 0.02 * abs(real.mean))
 
 
-def test_eval_command(finished):
+def test_eval_command(finished, capsys):
     run, _ = finished
-    done = command("eval", f"run={run.path}", "episodes=2", "backend=sim")
-    assert done.returncode == 0 and "Walker2d-v5 on c" in done.stdout
+    assert command_here("eval", f"run={run.path}", "episodes=2", "backend=sim") == 0
+    assert "Walker2d-v5 on c" in capsys.readouterr().out
 
 
 def test_the_same_seed_gives_the_same_run_and_another_does_not(tmp_path):
@@ -136,14 +136,15 @@ def test_nothing_is_compiled_twice():
     assert chunk._cache_size() == 1
 
 
-def test_a_sweep_puts_each_job_in_its_own_folder(tmp_path):
+def test_a_sweep_puts_each_job_in_its_own_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     arguments = [*TINY, f"total_steps={TINY_CHUNK}"]
-    done = command("train", "-m", "seed=0,1", *arguments, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert command_here("train", "-m", "seed=0,1", *arguments) == 0
     assert len(list(tmp_path.glob("runs/sweeps/*/*/metrics.jsonl"))) == 2
     # One job of a sweep that fails does not end the others.
-    done = command("train", "-m", "num_envs=7,8", *arguments[:1], *arguments[2:], cwd=tmp_path)
-    assert done.returncode == 2 and "choose num_envs a multiple of 2" in done.stderr and "Traceback" not in done.stderr
+    assert command_here("train", "-m", "num_envs=7,8", *arguments[:1], *arguments[2:]) == 2
+    printed = capsys.readouterr().err
+    assert "choose num_envs a multiple of 2" in printed and "Traceback" not in printed
     assert len(list(tmp_path.glob("runs/sweeps/*/*/metrics.jsonl"))) == 3
 
 
@@ -185,7 +186,6 @@ def test_configuration_can_be_printed(capsys):
 
 
 @pytest.mark.parametrize("arguments", [["env=walker2d", "--cfg", "job"], ["algo=sac", "--cfg", "job", "env=walker2d"]])
-def test_flags_may_stand_anywhere(arguments):
-    printed = command("train", *arguments)
-    assert printed.returncode == 0, printed.stderr
-    assert "name: walker2d" in printed.stdout
+def test_flags_may_stand_anywhere(arguments, capsys):
+    assert command_here("train", *arguments) == 0
+    assert "name: walker2d" in capsys.readouterr().out

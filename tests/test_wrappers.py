@@ -27,13 +27,13 @@ def walker():
 
 def test_terminal_observation_is_kept_and_sums_match_a_loop(walker):
     env = make_vector(walker, 3)
-    state = env.init(jax.random.PRNGKey(0), ())
-    alone = jax.tree.map(lambda x: x[0], state.env)
+    start = jax.jit(lambda key: env.init(key, ()))(jax.random.PRNGKey(0))
+    state, alone = start, jax.tree.map(lambda x: x[0], start.env)
     action = jnp.ones((3, 6))
     total, length, sums = 0.0, 0, {}
-    step = jax.jit(env.step)
+    step, step_alone = jax.jit(env.step), jax.jit(walker.step)
     for _ in range(30):
-        alone = walker.step(alone, action[0])
+        alone = step_alone(alone, action[0])
         total += float(alone.reward)
         length += 1
         state, outcome, stats = step(state, action)
@@ -48,10 +48,11 @@ def test_terminal_observation_is_kept_and_sums_match_a_loop(walker):
     in_pool = (state.pool.obs == state.env.obs[0]).all(axis=1)
     assert in_pool.any()
     one = make_vector(walker, 1)
-    state, stats_sum = one.init(jax.random.PRNGKey(0), ()), {}
-    state = state.replace(env=jax.tree.map(lambda x: x[:1], env.init(jax.random.PRNGKey(0), ()).env))
+    state, stats_sum = jax.jit(lambda key: one.init(key, ()))(jax.random.PRNGKey(0)), {}
+    state = state.replace(env=jax.tree.map(lambda x: x[:1], start.env))
+    step_one = jax.jit(one.step)
     for _ in range(length):
-        state, _, stats = jax.jit(one.step)(state, action[:1])
+        state, _, stats = step_one(state, action[:1])
         stats_sum = {name: stats_sum.get(name, 0.0) + float(value) for name, value in stats.items()}
     assert stats_sum["episodes"] == 1 and stats_sum["length"] == length and stats_sum["resets"] == 1
     assert stats_sum["return"] == pytest.approx(total, rel=1e-5)

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from commands import command
+from commands import command, command_here
 
 import mjx_walk
 from mjx_walk import zoo
@@ -39,15 +39,15 @@ def test_its_command_gives_its_settings(name):
     assert {key: asked[key] for key in learned_from} == {key: own[key] for key in learned_from}
 
 
-def test_scoring_one_does_not_write_into_the_package():
+def test_scoring_one_does_not_write_into_the_package(capsys):
     before = (open_existing("zoo:walker2d-sac").gymnasium_scores).read_bytes()
-    done = command("eval", "run=zoo:walker2d-sac", "episodes=1")
-    assert done.returncode == 0 and "Walker2d-v5: 7," in done.stdout, done.stderr
+    assert command_here("eval", "run=zoo:walker2d-sac", "episodes=1") == 0
+    assert "Walker2d-v5: 7," in capsys.readouterr().out
     assert (open_existing("zoo:walker2d-sac").gymnasium_scores).read_bytes() == before
 
 
-def test_the_table_and_an_unknown_name():
+def test_the_table_and_an_unknown_name(capsys):
     done = command("zoo")
-    assert done.returncode == 0 and done.stdout.count("python -m mjx_walk.train") == len(NAMES)
-    done = command("eval", "run=zoo:humanoid-dqn")
-    assert done.returncode == 2 and "no policy 'humanoid-dqn' in the zoo; choose one of: " in done.stderr
+    assert done.returncode == 0 and done.stdout.count("python -m mjx_walk.train") == len(NAMES), done.stderr
+    assert command_here("eval", "run=zoo:humanoid-dqn") == 2
+    assert "no policy 'humanoid-dqn' in the zoo; choose one of: " in capsys.readouterr().err

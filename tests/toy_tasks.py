@@ -97,6 +97,27 @@ class RewardedObservedAction(ObservedReward):
         return qpos, qvel, -jnp.square(action - 0.5 * qpos[0]), True
 
 
+class OneOf(ToyTask):
+    """The task at an index of `TASKS`, which may be traced: one program, vmapped, trains on all of them."""
+
+    TASKS = (ConstantReward, ObservedReward, DelayedReward, EndlessReward, RewardedAction, RewardedObservedAction)
+
+    def __init__(self, index, max_episode_steps: int = 3):
+        super().__init__(max_episode_steps)
+        self._index = index
+        self._tasks = [task(max_episode_steps) for task in self.TASKS]
+
+    def _choose(self, function, *arguments):
+        outcomes = [jax.tree.map(jnp.asarray, function(task, *arguments)) for task in self._tasks]
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves)[self._index], *outcomes)
+
+    def start(self, key):
+        return self._choose(lambda task: task.start(key))
+
+    def move(self, qpos, qvel, action, steps):
+        return self._choose(lambda task: task.move(qpos, qvel, action, steps))
+
+
 class MountainCar(ToyTask):
     """Source: `gymnasium/envs/classic_control/continuous_mountain_car.py`, v0."""
 

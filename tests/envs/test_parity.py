@@ -11,7 +11,7 @@ from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.physics import PhysicsState, make_engine, mjx_warp
 
 CASES = [(name, "v5", "warp") for name in TASKS]
-CASES += [("humanoid", "v4", "warp"), ("humanoid", "v5", "jax"), ("walker2d", "v5", "jax")]
+CASES += [("humanoid", "v4", "warp"), ("walker2d", "v5", "jax")]
 
 
 @pytest.mark.parametrize(("name", "version", "physics"), CASES)
@@ -69,12 +69,7 @@ def test_reset_observation(physics):
     np.testing.assert_array_equal(found.obs[:, -78:], 0.0)  # no contact forces at reset
 
 
-@pytest.mark.parametrize(
-    "buffers",
-    [{"CONSTRAINTS_PER_COPY": 8}, {"CONTACTS_PER_COPY": 0, "SPARE_CONTACTS": 20}],
-    ids=["constraints", "pairs"],
-)
-def test_warp_overflow_is_reported(monkeypatch, buffers):
+def test_warp_overflow_is_reported(monkeypatch):
     def overflows():
         task = make_env("humanoid_standup", physics="warp")
         states = jax.vmap(task.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
@@ -86,6 +81,8 @@ def test_warp_overflow_is_reported(monkeypatch, buffers):
         return jax.jit(lambda state: jax.lax.scan(one, state, length=20)[1].max())(states)
 
     assert overflows() == 0
-    for name, size in buffers.items():
-        monkeypatch.setattr(mjx_warp, name, size)
-    assert overflows() == 2
+    for buffers in ({"CONSTRAINTS_PER_COPY": 8}, {"CONTACTS_PER_COPY": 0, "SPARE_CONTACTS": 20}):
+        with monkeypatch.context() as patched:
+            for name, size in buffers.items():
+                patched.setattr(mjx_warp, name, size)
+            assert overflows() == 2, buffers
