@@ -12,7 +12,7 @@ from mjx_walk.profile import matmul_flops
 
 @pytest.mark.parametrize("algo", ["ppo", pytest.param("td3", marks=pytest.mark.slow)])
 def test_bench_measures_and_writes(tmp_path, algo):
-    arguments = ("env=walker2d", f"algo={algo}", "num_envs=16", "seconds=0.5", f"out={tmp_path}/bench.json")
+    arguments = ("env=walker2d", f"algo={algo}", "num_envs=32", "seconds=0.5", f"out={tmp_path}/bench.json")
     done = command("bench", *arguments)
     assert done.returncode == 0, done.stderr
     content = json.loads((tmp_path / "bench.json").read_text())
@@ -24,7 +24,7 @@ def test_bench_measures_and_writes(tmp_path, algo):
     inserts = [value for name, value in results.items() if name.startswith("insert of 4,096 transitions")]
     assert len(inserts) == (2 if algo == "td3" else 0) and all(value > 0 for value in inserts)
     assert results["compile and first update, cold cache"] > 0 and results["peak memory, host"] > 0.1
-    assert content["env"] == "Walker2d-v5" and content["versions"]["mujoco"] and "16 copies" in content["device"]
+    assert content["env"] == "Walker2d-v5" and content["versions"]["mujoco"] and "32 copies" in content["device"]
 
 
 def test_products_are_counted():

@@ -51,7 +51,7 @@ def test_variants_are_the_product_of_algorithms_swept_values_and_seeds(tmp_path)
     assert (last.algo.name, last.algo.discount, last.seed, last.total_steps) == ("a2c", 0.95, 7, 1000)
     assert last.run_dir == str(tmp_path / "a b's" / "a2c_discount-0.95" / "seed_7")
     copies = [cell.config.num_envs for cell in planned[:4]]
-    assert copies == [128, 128, 256, 256]  # each with its own recipe
+    assert copies == [64, 64, 256, 256]  # each with its own recipe
 
 
 def test_what_is_named_twice_is_run_once(tmp_path):

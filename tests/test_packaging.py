@@ -18,7 +18,7 @@ import mjx_walk, sys
 assert "jax" not in sys.modules, "import mjx_walk should be light"
 from mjx_walk.config import load_config
 from mjx_walk.envs import TASKS
-assert load_config(["env=walker2d"]).num_envs == 128
+assert load_config(["env=walker2d"]).num_envs == 64
 env = mjx_walk.make_env("walker2d", physics="c")
 assert type(env) is TASKS["walker2d"][0] and env.observation_size == 17
 print(mjx_walk.__file__)
