@@ -20,8 +20,8 @@ def test_walker2d_walks_after_the_cpu_recipe(tmp_path, algo, least):
     assert scores["mean"] >= least and len(scores["returns"]) == 100
 
 
-@pytest.mark.parametrize("physics", ["jax", "warp"])
-@pytest.mark.parametrize("version", ["v5", "v4"])
+# What v4 changes, observations, rewards and Walker2d's friction, is no engine's matter: one of them shows it.
+@pytest.mark.parametrize(("version", "physics"), [("v5", "jax"), ("v5", "warp"), ("v4", "warp")])
 @pytest.mark.parametrize("name", TASKS)
 def test_parity_of_all_versions(name, version, physics):
     found = parity.check(name, version, physics, num_copies=48, num_steps=120)
@@ -34,8 +34,7 @@ OWN = {
 }
 
 
-@pytest.mark.parametrize("physics", ["jax", "warp"])
-@pytest.mark.parametrize("algo", OWN)
+@pytest.mark.parametrize(("algo", "physics"), [("ppo", "jax"), ("ppo", "warp"), ("sac", "warp")])
 def test_humanoid_trains_through_mjx(tmp_path, algo, physics):
     """A small batch, from the command to the score, on each MJX engine."""
     small = ("num_envs=16", "evaluation.num_envs=2", "total_steps=4096", "algo.unroll_length=16")
