@@ -95,17 +95,13 @@ def train(name, task, **changes):
 
 
 @functools.cache
-def trained_on_all(name):
-    """Compiled once, which is what takes long here."""
+def trained(name):
+    """Value and action by the toy task. Compiled once, which is what takes long here."""
     indices = jnp.arange(len(toy_tasks.OneOf.TASKS))
     found = jax.vmap(lambda index: train(name, toy_tasks.OneOf(index)))(indices)
     value, action, sound = jax.tree.map(np.asarray, found)
     assert sound.all()
     return dict(zip(toy_tasks.OneOf.TASKS, zip(value, action, strict=True), strict=True))
-
-
-def trained(name, task_class):
-    return trained_on_all(name)[task_class]
 
 
 algorithms = pytest.mark.parametrize("name", list(SETTINGS))
@@ -114,18 +110,18 @@ with_values = pytest.mark.parametrize("name", [name for name in SETTINGS if name
 
 @with_values
 def test_constant_reward(name):
-    assert trained(name, toy_tasks.ConstantReward)[0][1] == pytest.approx(1.0, abs=0.05)
+    assert trained(name)[toy_tasks.ConstantReward][0][1] == pytest.approx(1.0, abs=0.05)
 
 
 @with_values
 def test_reward_seen_in_the_observation(name):
-    value = trained(name, toy_tasks.ObservedReward)[0]
+    value = trained(name)[toy_tasks.ObservedReward][0]
     assert value[[0, 2]] == pytest.approx([-1.0, 1.0], abs=0.1)
 
 
 @with_values
 def test_discounting(name):
-    value = trained(name, toy_tasks.DelayedReward)[0]
+    value = trained(name)[toy_tasks.DelayedReward][0]
     assert value[[1, 2]] == pytest.approx([DISCOUNT, 1.0], abs=0.05)
 
 
@@ -152,18 +148,18 @@ def test_an_entropy_that_changes():
 
 @with_values
 def test_a_time_limit_does_not_end_the_future(name):
-    value = trained(name, toy_tasks.EndlessReward)[0]
+    value = trained(name)[toy_tasks.EndlessReward][0]
     assert value[1] == pytest.approx(1.0 / (1.0 - DISCOUNT), abs=0.1)
 
 
 @algorithms
 def test_reward_for_an_action(name):
-    assert trained(name, toy_tasks.RewardedAction)[1][1] == pytest.approx(0.5, abs=0.1)
+    assert trained(name)[toy_tasks.RewardedAction][1][1] == pytest.approx(0.5, abs=0.1)
 
 
 @algorithms
 def test_reward_for_an_action_that_suits_the_observation(name):
-    value, action = trained(name, toy_tasks.RewardedObservedAction)
+    value, action = trained(name)[toy_tasks.RewardedObservedAction]
     assert action[[0, 2]] == pytest.approx([-0.5, 0.5], abs=0.15)
     if name != "reinforce":
         assert value[[0, 2]] == pytest.approx([0.0, 0.0], abs=0.5 if name in ("ppo", "a2c") else 0.1)

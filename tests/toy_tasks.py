@@ -102,10 +102,10 @@ class OneOf(ToyTask):
 
     TASKS = (ConstantReward, ObservedReward, DelayedReward, EndlessReward, RewardedAction, RewardedObservedAction)
 
-    def __init__(self, index, max_episode_steps: int = 3):
-        super().__init__(max_episode_steps)
+    def __init__(self, index):
+        super().__init__(max_episode_steps=3)
         self._index = index
-        self._tasks = [task(max_episode_steps) for task in self.TASKS]
+        self._tasks = [task() for task in self.TASKS]
 
     def _choose(self, function, *arguments):
         outcomes = [jax.tree.map(jnp.asarray, function(task, *arguments)) for task in self._tasks]

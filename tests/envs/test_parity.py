@@ -12,6 +12,7 @@ from mjx_walk.envs.physics import PhysicsState, make_engine, mjx_warp
 
 CASES = [(name, "v5", "warp") for name in TASKS]
 CASES += [("humanoid", "v4", "warp"), ("walker2d", "v5", "jax")]
+CASES += [pytest.param("humanoid", "v5", "jax", marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize(("name", "version", "physics"), CASES)
