@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from subprocess import PIPE, STDOUT
 from typing import Any
 
 import gymnasium
@@ -17,12 +18,14 @@ import jax.numpy as jnp
 from mjx_walk import cli, profile
 from mjx_walk.algos import ALGORITHMS, make_algorithm
 from mjx_walk.api import make_task, resolve
-from mjx_walk.config import Config, compile_cache_dir
+from mjx_walk.child_process import start_module
+from mjx_walk.config import Config
 from mjx_walk.envs import TASKS, State, Task
 from mjx_walk.envs.physics import make_engine
 from mjx_walk.errors import UserError
 from mjx_walk.evaluation import versions
 from mjx_walk.loop import make_chunk, make_init
+from mjx_walk.metrics import read_rows
 from mjx_walk.off_policy import OffPolicyConfig
 from mjx_walk.replay import ReplayBuffer, Steps
 from mjx_walk.settings import setting
@@ -70,6 +73,8 @@ def main(arguments: list[str]) -> None:
         results[name] = value
         print(f"  {name:<44} {value:>12,.1f} {unit}", flush=True)
 
+    for name, value in first_chunk_times(overrides).items():
+        report(name, value, "s")
     gym_speed = gymnasium_speed(task, parsed.seconds)
     report("Gymnasium, one core", gym_speed, "env-steps/s")
     for name, measure in {
@@ -78,10 +83,10 @@ def main(arguments: list[str]) -> None:
     }.items():
         report(name, measure(task, config.num_envs, parsed.seconds), "env-steps/s")
     algorithm = _learning_at_once(config, task)
-    for name, value in training_figures(config, task, algorithm, parsed.seconds).items():
-        report(name, value, "s" if name.startswith("compile") else "env-steps/s")
+    fused = task.engine.name != "c"
+    report("training", training_speed(config, algorithm, fused, parsed.seconds), "env-steps/s")
     report("training / Gymnasium on one core", results["training"] / gym_speed, "times")
-    for name, value, unit in where_time_goes(config, algorithm, results["physics only"], parsed.seconds):
+    for name, value, unit in where_time_goes(config, algorithm, fused, results["physics only"], parsed.seconds):
         report(name, value, unit)
     for name, value in peak_memory().items():
         report(name, value, "GiB")
@@ -146,24 +151,41 @@ def step_speed(task: Task, num_envs: int, seconds: float) -> float:
     return _speed_under_random_actions(task, num_envs, seconds, lambda state: state, jax.vmap(task.step))
 
 
-def training_figures(config: Config, task: Task, algorithm: Algorithm, seconds: float) -> dict[str, float]:
-    """Training end to end as the loop runs it, and the compile time of its programs without and with a cache."""
-    old_cache = compile_cache_dir()
-    figures = {}
-    with tempfile.TemporaryDirectory() as cache:
-        jax.config.update("jax_compilation_cache_dir", cache)
-        for name in ("compile and first update, cold cache", "compile and first update, warm cache"):
-            jax.clear_caches()
-            jax.experimental.compilation_cache.compilation_cache.reset_cache()
-            start = time.monotonic()
-            chunk = make_chunk(algorithm, config.updates_per_chunk, fused=task.engine.name != "c")
-            state = make_init(algorithm)(jax.random.PRNGKey(0))
-            state = jax.block_until_ready(chunk(state)[0])
-            figures[name] = time.monotonic() - start
-        jax.config.update("jax_compilation_cache_dir", old_cache)
+def first_chunk_times(overrides: list[str]) -> dict[str, float]:
+    """Seconds from the trainer's start to the end of its first chunk, without and with what JAX and Warp cache.
+
+    Each in a process of its own: Warp numbers its calls within a process, and the numbers are part of JAX's programs,
+    so that a process never finds its own ones again.
+
+    Raises:
+        RuntimeError: training failed.
+    """
+    times = {}
+    with tempfile.TemporaryDirectory() as folder:
+        places = {"JAX_COMPILATION_CACHE_DIR": f"{folder}/jax", "WARP_CACHE_PATH": f"{folder}/warp"}
+        for name in ("cold", "warm"):
+            run_dir = Path(folder, name)
+            whole = [*overrides, "total_steps=1", "evaluation.gymnasium_episodes=0", f"run_dir={run_dir}"]
+            # The memory is this process's, too.
+            env = places | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+            with start_module("train", *whole, env=env, stdout=PIPE, stderr=STDOUT, text=True) as process:
+                try:
+                    output, _ = process.communicate()
+                finally:
+                    process.kill()
+            if process.returncode:
+                raise RuntimeError(f"train {' '.join(whole)}: {output}")
+            first, *_ = read_rows(run_dir / "metrics.jsonl")
+            times[f"compile and first chunk, {name} caches"] = first["wall_seconds"]
+    return times
+
+
+def training_speed(config: Config, algorithm: Algorithm, fused: bool, seconds: float) -> float:
+    """Steps per second of training end to end, as the loop runs it."""
+    chunk = make_chunk(algorithm, config.updates_per_chunk, fused)
+    state = make_init(algorithm)(jax.random.PRNGKey(0))
     steps_per_chunk = algorithm.steps_per_update * config.updates_per_chunk
-    speed = profile.steps_per_second(lambda state: chunk(state)[0], state, steps_per_chunk, seconds)
-    return figures | {"training": speed}
+    return profile.steps_per_second(lambda state: chunk(state)[0], state, steps_per_chunk, seconds)
 
 
 def _learning_at_once(config: Config, task: Task) -> Algorithm:
@@ -175,10 +197,10 @@ def _learning_at_once(config: Config, task: Task) -> Algorithm:
 
 
 def where_time_goes(
-    config: Config, algorithm: Algorithm, physics_speed: float, seconds: float
+    config: Config, algorithm: Algorithm, fused: bool, physics_speed: float, seconds: float
 ) -> list[tuple[str, float, str]]:
     """Names, values and units: of one update, what collecting and learning take, and the least that each could."""
-    parts = profile.time_parts(algorithm, seconds)
+    parts = profile.time_parts(algorithm, config.updates_per_chunk, fused, seconds)
     flops, peak = profile.learning_flops(algorithm), profile.matmul_speed(config.algo.network_dtype, seconds)
     return [
         ("an update: collecting", parts["collecting"] * 1e3, "ms"),

@@ -6,44 +6,50 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.extend import core
 
-from mjx_walk.loop import make_init
-from mjx_walk.types import Algorithm
+from mjx_walk.loop import make_chunk, make_init
+from mjx_walk.types import Algorithm, Metrics, TrainState
 
 
 def steps_per_second(advance: Callable[[Any], Any], carry: Any, steps_per_call: int, seconds: float) -> float:
     """Time repeated calls of `carry → carry`, the first of which compiles and is not counted."""
+    return steps_per_call / _seconds_per_call(advance, carry, seconds)[1]
+
+
+def _seconds_per_call(advance: Callable[[Any], Any], carry: Any, seconds: float) -> tuple[Any, float]:
     carry = jax.block_until_ready(advance(carry))
     start, calls = time.monotonic(), 0
     while time.monotonic() - start < seconds:
         carry = jax.block_until_ready(advance(carry))
         calls += 1
-    return calls * steps_per_call / (time.monotonic() - start)
+    return carry, (time.monotonic() - start) / calls
 
 
-def time_parts(algorithm: Algorithm, seconds: float) -> dict[str, float]:
-    """Seconds of collecting and of learning in one update, each a program of its own, in turn as in training.
+def time_parts(algorithm: Algorithm, updates_per_chunk: int, fused: bool, seconds: float) -> dict[str, float]:
+    """Seconds of collecting and of learning in one update.
+
+    Collecting is timed in chunks that only collect: Warp records its kernels anew wherever its arrays lie at new
+    addresses, as they do from call to call of a program that collects once.
 
     Args:
         algorithm: whose replay, if it has one, learns from the first step on.
-        seconds: to measure for.
+        updates_per_chunk: as the loop runs them.
+        fused: see `make_chunk`.
+        seconds: to measure each for.
     """
-    collect = jax.jit(algorithm.collect, donate_argnums=0)
-    learn = jax.jit(algorithm.learn, donate_argnums=0)
+
+    def read(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
+        return state, {"all": sum(jnp.sum(x, dtype=jnp.float32) for x in jax.tree.leaves(batch))}
+
+    only_collect = make_chunk(algorithm._replace(learn=read), updates_per_chunk, fused)
     state = make_init(algorithm)(jax.random.PRNGKey(0))
-    spent = {"collecting": 0.0, "learning": 0.0}
-    num_updates = -2  # the first two compile
-    while sum(spent.values()) < seconds or num_updates < 1:
-        start = time.monotonic()
-        state, batch = jax.block_until_ready(collect(state))
-        between = time.monotonic()
-        state, _ = jax.block_until_ready(learn(state, batch))
-        if num_updates >= 0:
-            spent["collecting"] += between - start
-            spent["learning"] += time.monotonic() - between
-        num_updates += 1
-    return {name: total / num_updates for name, total in spent.items()}
+    state, collecting = _seconds_per_call(lambda state: only_collect(state)[0], state, seconds)
+    state, batch = jax.jit(algorithm.collect, donate_argnums=0)(state)
+    learn = jax.jit(algorithm.learn, donate_argnums=0)
+    _, learning = _seconds_per_call(lambda state: learn(state, batch)[0], state, seconds)
+    return {"collecting": collecting / updates_per_chunk, "learning": learning}
 
 
 def learning_flops(algorithm: Algorithm) -> float:
