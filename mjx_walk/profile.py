@@ -41,7 +41,7 @@ def time_parts(algorithm: Algorithm, updates_per_chunk: int, fused: bool, second
     """
 
     def read(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
-        return state, {"all": sum(jnp.sum(x, dtype=jnp.float32) for x in jax.tree.leaves(batch))}
+        return state, {"all": jnp.stack([jnp.sum(x, dtype=jnp.float32) for x in jax.tree.leaves(batch)]).sum()}
 
     only_collect = make_chunk(algorithm._replace(learn=read), updates_per_chunk, fused)
     state = make_init(algorithm)(jax.random.PRNGKey(0))
