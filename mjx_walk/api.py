@@ -163,7 +163,13 @@ def train(
             flush=True,
         )
     elif not signal_name:
-        trainer.score()
+        try:
+            trainer.score()
+        except KeyboardInterrupt:
+            for folder in folders:
+                if not folder.gymnasium_scores.exists():
+                    print(f"Trained and saved, not scored. To score: python -m mjx_walk.eval run={folder.path}")
+            raise
     return folders, signal_name
 
 

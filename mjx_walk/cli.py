@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mjx_walk.errors import UserError
+from mjx_walk.interrupt import exit_code
 from mjx_walk.settings import validate
 
 Arguments = TypeVar("Arguments")
@@ -77,9 +78,12 @@ def check_writable(path: Path) -> None:
 
 
 def main(command: Callable[[list[str]], int | None]) -> NoReturn:
-    """Run a command on the process's arguments and exit with its code."""
+    """Run a command on the process's arguments and exit with its code; a mistake or Ctrl-C costs one line."""
     try:
         sys.exit(command(sys.argv[1:]) or 0)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:
+        print("Stopped by Ctrl-C.", file=sys.stderr)
+        sys.exit(exit_code("SIGINT"))

@@ -13,7 +13,11 @@ import numpy as np
 
 
 def serve() -> None:
-    """Serve one parent until it closes the pipe."""
+    """Serve one parent.
+
+    Raises:
+        EOFError, BrokenPipeError: it has closed its pipes.
+    """
     # Whatever a library prints must not end up between the pickles.
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
@@ -27,10 +31,7 @@ def serve() -> None:
     is_over = np.zeros(len(envs), bool)
     _send(answers, obs)
     while True:
-        try:
-            actions = pickle.load(sys.stdin.buffer)
-        except EOFError:
-            return
+        actions = pickle.load(sys.stdin.buffer)
         rewards = np.zeros(len(envs))
         for i in np.flatnonzero(~is_over):
             obs[i], rewards[i], terminated, truncated, _ = envs[i].step(actions[i])
@@ -44,4 +45,7 @@ def _send(pipe, message) -> None:
 
 
 if __name__ == "__main__":
-    serve()
+    try:
+        serve()
+    except (EOFError, BrokenPipeError):
+        os._exit(0)  # The parent has gone, or is done: nobody reads what is still buffered.

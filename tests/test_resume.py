@@ -3,6 +3,7 @@
 import functools
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from test_checkpoint import flip_a_byte
 
 from mjx_walk import checkpoint
 from mjx_walk.api import resolve
+from mjx_walk.child_process import start_module
 
 
 def leaves(run_dir, chunk):
@@ -142,3 +144,27 @@ def test_signals_finish_the_chunk_save_and_say_how_to_go_on(tmp_path, name):
     newest = checkpoint.list_steps(run_dir / "checkpoints")[-1]
     assert int(newest.name) == last
     assert resolve([f"run_dir={run_dir}", "resume=true"]).env.name == "walker2d"
+
+
+def test_ctrl_c_while_a_policy_is_scored_says_how_to_score_it(tmp_path, monkeypatch, capsys):
+    def ctrl_c(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mjx_walk.recorder.score_in_gymnasium", ctrl_c)
+    whole = (*TINY, "evaluation.gymnasium_episodes=2", f"total_steps={TINY_CHUNK}", f"run_dir={tmp_path / 'run'}")
+    assert command_here("train", *whole) == 130
+    said = capsys.readouterr()
+    assert f"python -m mjx_walk.eval run={tmp_path / 'run'}" in said.out and "Stopped by Ctrl-C." in said.err
+    monkeypatch.undo()
+    assert command_here("eval", f"run={tmp_path / 'run'}", "episodes=2") == 0
+
+
+def test_a_gymnasium_process_whose_parent_is_gone_ends_quietly():
+    worker = start_module("gymnasium_worker", stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    pickle.dump(("Walker2d-v5", {}, [0]), worker.stdin)
+    worker.stdin.flush()
+    assert pickle.load(worker.stdout).shape == (1, 17)
+    worker.stdout.close()
+    pickle.dump(np.zeros((1, 6)), worker.stdin)
+    worker.stdin.close()
+    assert worker.stderr.read() == b"" and worker.wait() == 0
