@@ -64,6 +64,8 @@ def main(arguments: list[str]) -> None:
         overrides.append(f"num_envs={parsed.num_envs}")
     config = resolve(overrides)
     jax.config.update("jax_default_matmul_precision", config.matmul_precision)
+    print("Two trainings of one chunk, in processes of their own …", flush=True)
+    first_chunks = first_chunk_times(overrides)  # before this process takes the device's memory
     task = make_task(config)
     device = f"{jax.devices()[0].device_kind}, physics={task.engine.name}, {config.num_envs} copies"
     print(f"{task.gymnasium_id} on {device}", flush=True)
@@ -73,7 +75,7 @@ def main(arguments: list[str]) -> None:
         results[name] = value
         print(f"  {name:<44} {value:>12,.1f} {unit}", flush=True)
 
-    for name, value in first_chunk_times(overrides).items():
+    for name, value in first_chunks.items():
         report(name, value, "s")
     gym_speed = gymnasium_speed(task, parsed.seconds)
     report("Gymnasium, one core", gym_speed, "env-steps/s")
@@ -158,7 +160,8 @@ def first_chunk_times(overrides: list[str]) -> dict[str, float]:
     so that a process never finds its own ones again.
 
     Raises:
-        RuntimeError: training failed.
+        UserError: training refuses these settings.
+        RuntimeError: it failed.
     """
     times = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -166,13 +169,13 @@ def first_chunk_times(overrides: list[str]) -> dict[str, float]:
         for name in ("cold", "warm"):
             run_dir = Path(folder, name)
             whole = [*overrides, "total_steps=1", "evaluation.gymnasium_episodes=0", f"run_dir={run_dir}"]
-            # The memory is this process's, too.
-            env = places | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-            with start_module("train", *whole, env=env, stdout=PIPE, stderr=STDOUT, text=True) as process:
+            with start_module("train", *whole, env=places, stdout=PIPE, stderr=STDOUT, text=True) as process:
                 try:
                     output, _ = process.communicate()
                 finally:
                     process.kill()
+            if process.returncode == 2:
+                raise UserError(output.splitlines()[-1].removeprefix("error: "))
             if process.returncode:
                 raise RuntimeError(f"train {' '.join(whole)}: {output}")
             first, *_ = read_rows(run_dir / "metrics.jsonl")

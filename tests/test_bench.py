@@ -5,7 +5,7 @@ import json
 import jax
 import jax.numpy as jnp
 import pytest
-from commands import command
+from commands import command, command_here
 
 from mjx_walk.profile import matmul_flops
 
@@ -26,6 +26,11 @@ def test_bench_measures_and_writes(tmp_path, algo):
     assert all(results[f"compile and first chunk, {name} caches"] > 0 for name in ("cold", "warm"))
     assert results["peak memory, host"] > 0.1
     assert content["env"] == "Walker2d-v5" and content["versions"]["mujoco"] and "32 copies" in content["device"]
+
+
+def test_a_mistake_in_the_settings_costs_one_line(capsys):
+    assert command_here("bench", "env=walker2d", "num_envs=3") == 2
+    assert capsys.readouterr().err.startswith("error: num_envs=3 times algo.num_unrolls=1 does not divide")
 
 
 def test_products_are_counted():
