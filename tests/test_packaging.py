@@ -107,3 +107,10 @@ def test_editable(clone, tmp_path):
         capture_output=True,
     )
     assert python_use(tmp_path, executable=python).is_relative_to(clone)
+
+
+@pytest.mark.parametrize("module", ["mjx_walk.algos", "mjx_walk.envs"])
+def test_where_warp_is_not_installed_mjx_does_not_say_so(module):
+    code = f"import sys; sys.modules['warp'] = None; import {module}, mujoco.mjx; print(mujoco.mjx.__name__)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=CLONE, capture_output=True, text=True, check=True)
+    assert done.stdout == "mujoco.mjx\n"
