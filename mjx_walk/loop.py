@@ -183,14 +183,17 @@ class Trainer:
         return signal_name
 
     def score(self) -> None:
-        """Score every run in the real Gymnasium; see `Recorder.score`."""
+        """Score every run in the real Gymnasium; see `Recorder.score`. However it ends, all is on the disk then."""
         seconds = self._seconds()  # the same for all, whichever is scored first
-        for recorder in self.recorders:
-            scores = recorder.score(seconds)
-            which = f"seed {recorder.config.seed}: " if len(self.recorders) > 1 else ""
-            if scores:
-                print(f"{which}In the real Gymnasium, {scores}", flush=True)
-            recorder.wait()
+        try:
+            for recorder in self.recorders:
+                scores = recorder.score(seconds)
+                which = f"seed {recorder.config.seed}: " if len(self.recorders) > 1 else ""
+                if scores:
+                    print(f"{which}In the real Gymnasium, {scores}", flush=True)
+        finally:  # also where Ctrl-C ends it
+            for recorder in self.recorders:
+                recorder.wait()
 
     def _start(self) -> tuple[TrainState, int]:
         """The TrainState to begin with, and the number of chunks behind it."""
