@@ -7,7 +7,6 @@ import dataclasses
 import difflib
 from typing import Any
 
-from mjx_walk import mjx_without_warp  # noqa: F401
 from mjx_walk.envs.humanoid import Humanoid, HumanoidOptions
 from mjx_walk.envs.humanoid_standup import HumanoidStandup, HumanoidStandupOptions
 from mjx_walk.envs.task import NO_TIME_LIMIT, State, Task, TaskOptions

@@ -109,8 +109,14 @@ def test_editable(clone, tmp_path):
     assert python_use(tmp_path, executable=python).is_relative_to(clone)
 
 
-@pytest.mark.parametrize("module", ["mjx_walk.algos", "mjx_walk.envs"])
-def test_where_warp_is_not_installed_mjx_does_not_say_so(module):
-    code = f"import sys; sys.modules['warp'] = None; import {module}, mujoco.mjx; print(mujoco.mjx.__name__)"
+@pytest.mark.parametrize("use", ["import mjx_walk.algos", "mjx_walk.make_env('walker2d', physics='jax')"])
+def test_where_warp_is_not_installed_mjx_does_not_say_so(use):
+    code = f"import sys; sys.modules['warp'] = None; import mjx_walk; {use}; print(sys.modules['mujoco.mjx'].__name__)"
     done = subprocess.run([sys.executable, "-c", code], cwd=CLONE, capture_output=True, text=True, check=True)
     assert done.stdout == "mujoco.mjx\n"
+
+
+def test_the_c_engine_does_not_wait_for_mjx():
+    code = "import mjx_walk, sys; mjx_walk.make_env('walker2d', physics='c'); print('mujoco.mjx' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=CLONE, capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
