@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from subprocess import PIPE, STDOUT
+from subprocess import STDOUT
 from typing import Any
 
 import gymnasium
@@ -85,7 +85,7 @@ def main(arguments: list[str]) -> None:
     }.items():
         report(name, measure(task, config.num_envs, parsed.seconds), "env-steps/s")
     algorithm = _learning_at_once(config, task)
-    fused = task.engine.name != "c"
+    fused = not task.engine.calls_host
     report("training", training_speed(config, algorithm, fused, parsed.seconds), "env-steps/s")
     report("training / Gymnasium on one core", results["training"] / gym_speed, "times")
     for name, value, unit in where_time_goes(config, algorithm, fused, results["physics only"], parsed.seconds):
@@ -168,18 +168,23 @@ def first_chunk_times(overrides: list[str]) -> dict[str, float]:
         places = {"JAX_COMPILATION_CACHE_DIR": f"{folder}/jax", "WARP_CACHE_PATH": f"{folder}/warp"}
         for name in ("cold", "warm"):
             run_dir = Path(folder, name)
+            output = Path(folder, f"{name}.txt")
             whole = [*overrides, "total_steps=1", "evaluation.gymnasium_episodes=0", f"run_dir={run_dir}"]
-            with start_module("train", *whole, env=places, stdout=PIPE, stderr=STDOUT, text=True) as process:
+            with (
+                output.open("w") as file,
+                start_module("train", *whole, env=places, stdout=file, stderr=STDOUT) as process,
+            ):
                 try:
-                    output, _ = process.communicate()
+                    while process.poll() is None and not read_rows(run_dir / "metrics.jsonl"):
+                        time.sleep(0.1)
                 finally:
-                    process.kill()
-            if process.returncode == 2:
-                raise UserError(output.splitlines()[-1].removeprefix("error: "))
-            if process.returncode:
-                raise RuntimeError(f"train {' '.join(whole)}: {output}")
-            first, *_ = read_rows(run_dir / "metrics.jsonl")
-            times[f"compile and first chunk, {name} caches"] = first["wall_seconds"]
+                    process.kill()  # before it has written a replay to the disk
+            rows = read_rows(run_dir / "metrics.jsonl")
+            if not rows and process.returncode == 2:
+                raise UserError(output.read_text().splitlines()[-1].removeprefix("error: "))
+            if not rows:
+                raise RuntimeError(f"train {' '.join(whole)}: {output.read_text()}")
+            times[f"compile and first chunk, {name} caches"] = rows[0]["wall_seconds"]
     return times
 
 

@@ -112,7 +112,7 @@ class Trainer:
             self._chunk = team.make_chunk(alone, config.updates_per_chunk, task.reward_terms)
         else:
             self.algorithm = over_seeds(alone) if len(configs) > 1 else alone
-            self._chunk = make_chunk(self.algorithm, config.updates_per_chunk, fused=task.engine.name != "c")
+            self._chunk = make_chunk(self.algorithm, config.updates_per_chunk, fused=not task.engine.calls_host)
         self._has_axis = team is not None or len(configs) > 1  # in front of every array
         self._are_sound = jax.jit(jax.vmap(self._has_finite_policy) if self._has_axis else self._has_finite_policy)
         self._on_metrics = on_metrics or (lambda row: None)

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from mjx_walk import checkpoint, plots
+from mjx_walk import checkpoint
 from mjx_walk.config import Config
 from mjx_walk.envs import Task
 from mjx_walk.evaluation import Scores, score_in_gymnasium
@@ -100,7 +100,9 @@ class Recorder:
         self._writer.close()
         if self._wandb:
             self._wandb.close()
-        plots.plot_run(self._folder)
+        from mjx_walk.plots import plot_run  # Matplotlib, which training need not wait for when it begins
+
+        plot_run(self._folder)
         self._policies = [(self._algorithm.policy_params(state), {"env_steps": env_steps})]
         best = self._best_policy(state)
         if best:

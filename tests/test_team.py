@@ -160,3 +160,25 @@ def test_a_signal_stops_all_devices_at_the_same_step(tmp_path):
     checkpoints = tmp_path / "run" / "checkpoints"
     first, second = (checkpoint.list_steps(folder)[-1] for folder in (checkpoints, checkpoints / "device_1"))
     assert first.name == second.name
+
+
+@pytest.mark.slow
+def test_ctrl_c_while_a_team_is_scored_says_how_to_score_it(tmp_path):
+    long = ["evaluation.gymnasium_episodes=200", "env.terminate_when_unhealthy=false"]  # a minute or so
+    settings = [f"run_dir={tmp_path}/run", "devices=2", *long, "total_steps=1"]
+    parent = subprocess.Popen(
+        [sys.executable, "-m", "mjx_walk.train", *TINY, *settings],
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 300
+    while time.monotonic() < deadline and not (tmp_path / "run" / "reward_terms.png").exists():
+        time.sleep(0.1)
+    time.sleep(3)  # the plot is drawn just before scoring begins
+    parent.send_signal(signal.SIGINT)
+    out, errors = parent.communicate(timeout=120)
+    assert parent.returncode == 128 + signal.SIGINT and "Traceback" not in out + errors
+    assert f"To score: python -m mjx_walk.eval run={tmp_path}/run" in out
+    assert checkpoint.list_steps(tmp_path / "run" / "checkpoints")

@@ -30,6 +30,8 @@ class Engine(Protocol):
     """
 
     name: str
+    calls_host: bool
+    """It steps by a callback to the host. JAX keeps no program with one in its compile cache."""
 
     def forward(self, state: PhysicsState) -> Derived:
         """Derived arrays of a state just set, at zero control. Source: Gymnasium's `set_state` (`mj_forward`)."""

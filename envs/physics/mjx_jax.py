@@ -22,6 +22,7 @@ class JaxEngine:
     """MJX in float32. The networks' matmul precision does not reach it: its products are always full float32."""
 
     name = "jax"
+    calls_host = False
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
         if model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:

@@ -30,6 +30,7 @@ class WarpEngine:
     """MuJoCo Warp in float32, called once a substep for the whole batch."""
 
     name = "warp"
+    calls_host = False
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
         # Without a GPU, Warp would warn that it has found none.

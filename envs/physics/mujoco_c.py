@@ -21,6 +21,7 @@ class CEngine:
     """
 
     name = "c"
+    calls_host = True
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
         self._model = model
