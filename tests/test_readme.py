@@ -80,7 +80,7 @@ def test_commands_of_the_tables_are_recipes():
     commands += re.findall(r"\| `python -m mjx_walk\.train (env=[^`]+)` \|$", README, flags=re.MULTILINE)
     assert len(commands) > 25 and zoo.table() in README
     for line in commands:
-        config = load_config(["hardware=gpu", *line.split()])
+        config = load_config(["hardware=gpu", *shlex.split(line)])
         assert config.total_steps > 1e6 and f"algo={config.algo.name}" in line
 
 
