@@ -75,7 +75,7 @@ def _train_in_team(settings: list[str], team: Team) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         os._exit(2)
-    except KeyboardInterrupt:  # while it is scored; what is saved is said already
+    except KeyboardInterrupt:  # while it is scored, or the second one; what is saved is said already
         sys.stdout.flush()
         os._exit(exit_code("SIGINT"))
     except BaseException:
