@@ -124,17 +124,30 @@ def test_two_processes_learn_the_same_and_resume_exactly(tmp_path, tiny):
         run(tmp_path / "parted", f"total_steps={(4 + 2 * devices) * CHUNK}", "resume=true", tiny=tiny, devices=devices)
 
 
+def start(*arguments):
+    """Training, to be disturbed."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "mjx_walk.train", *TINY, *arguments],
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_until(is_so):
+    deadline = time.monotonic() + 300
+    while not is_so():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
 @pytest.mark.slow
 def test_a_process_that_dies_ends_the_run_which_goes_on_from_its_checkpoint(tmp_path):
     settings = [f"run_dir={tmp_path}/run", "devices=2"]
-    arguments = [*TINY, *settings, "checkpoint.every_chunks=1", f"total_steps={60 * CHUNK}"]
-    parent = subprocess.Popen(
-        [sys.executable, "-m", "mjx_walk.train", *arguments], env=ENVIRONMENT, stderr=subprocess.PIPE, text=True
-    )
+    parent = start(*settings, "checkpoint.every_chunks=1", f"total_steps={60 * CHUNK}")
     second = tmp_path / "run" / "checkpoints" / "device_1"
-    deadline = time.monotonic() + 300
-    while time.monotonic() < deadline and len(list(second.glob("0*"))) < 2:
-        time.sleep(0.1)
+    wait_until(lambda: len(list(second.glob("0*"))) >= 2)
     children = subprocess.run(["pgrep", "-P", str(parent.pid)], capture_output=True, text=True, check=True)
     os.kill(int(children.stdout.split()[-1]), signal.SIGKILL)
     _, errors = parent.communicate(timeout=120)
@@ -147,13 +160,8 @@ def test_a_process_that_dies_ends_the_run_which_goes_on_from_its_checkpoint(tmp_
 
 @pytest.mark.slow
 def test_a_signal_stops_all_devices_at_the_same_step(tmp_path):
-    settings = [*TINY, f"run_dir={tmp_path}/run", "devices=2", "total_steps=100000000"]
-    parent = subprocess.Popen(
-        [sys.executable, "-m", "mjx_walk.train", *settings], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
-    )
-    deadline = time.monotonic() + 300
-    while time.monotonic() < deadline and not list(tmp_path.glob("run/checkpoints/0*")):
-        time.sleep(0.1)
+    parent = start(f"run_dir={tmp_path}/run", "devices=2", "total_steps=100000000")
+    wait_until(lambda: list(tmp_path.glob("run/checkpoints/0*")))
     parent.send_signal(signal.SIGTERM)
     out, _ = parent.communicate(timeout=120)
     assert parent.returncode == 128 + signal.SIGTERM and "Stopped by SIGTERM and saved" in out
@@ -165,17 +173,8 @@ def test_a_signal_stops_all_devices_at_the_same_step(tmp_path):
 @pytest.mark.slow
 def test_ctrl_c_while_a_team_is_scored_says_how_to_score_it(tmp_path):
     long = ["evaluation.gymnasium_episodes=200", "env.terminate_when_unhealthy=false"]  # a minute or so
-    settings = [f"run_dir={tmp_path}/run", "devices=2", *long, "total_steps=1"]
-    parent = subprocess.Popen(
-        [sys.executable, "-m", "mjx_walk.train", *TINY, *settings],
-        env=ENVIRONMENT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    deadline = time.monotonic() + 300
-    while time.monotonic() < deadline and not (tmp_path / "run" / "reward_terms.png").exists():
-        time.sleep(0.1)
+    parent = start(f"run_dir={tmp_path}/run", "devices=2", *long, "total_steps=1")
+    wait_until((tmp_path / "run" / "reward_terms.png").exists)
     time.sleep(3)  # the plot is drawn just before scoring begins
     parent.send_signal(signal.SIGINT)
     out, errors = parent.communicate(timeout=120)
