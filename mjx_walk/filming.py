@@ -11,8 +11,6 @@ from typing import Any
 import imageio.v3 as iio
 import jax
 import numpy as np
-from tensorboardX import SummaryWriter
-from tensorboardX.proto.summary_pb2 import Summary
 
 import mjx_walk
 from mjx_walk import checkpoint
@@ -21,6 +19,7 @@ from mjx_walk.config import Config, save_config
 from mjx_walk.episode import record_episode
 from mjx_walk.rendering import write_film
 from mjx_walk.run_folder import RunFolder
+from mjx_walk.tensorboard import Summary, SummaryWriter
 
 _SIZE = (320, 240)
 _FRAMES_PER_SECOND = 25.0

@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
+from mjx_walk.tensorboard import SummaryWriter
 from mjx_walk.types import Metrics
 
 Row = dict[str, float]

@@ -120,3 +120,17 @@ def test_the_c_engine_does_not_wait_for_mjx():
     code = "import mjx_walk, sys; mjx_walk.make_env('walker2d', physics='c'); print('mujoco.mjx' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=CLONE, capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+def test_mjx_is_not_searched_for_garbage():
+    code = "import gc; from mjx_walk import mjx_import; print(gc.isenabled(), gc.get_freeze_count() > 100_000)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=CLONE, capture_output=True, text=True, check=True)
+    assert done.stdout == "True True\n"
+
+
+def test_tensorboard_does_not_wait_for_pytorch(tmp_path):
+    (tmp_path / "torch.py").write_text("print('PyTorch')\nclass Tensor: ...")
+    code = "import mjx_walk.tensorboard; print('TensorBoard'); import torch"
+    environment = os.environ | {"PYTHONPATH": f"{CLONE}{os.pathsep}{tmp_path}"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "TensorBoard\nPyTorch\n"

@@ -54,7 +54,7 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
 
         return WarpEngine(model, num_substeps, derived)
     if name == "jax":
-        from mjx_walk import mjx_without_warp  # noqa: F401
+        from mjx_walk import mjx_import  # noqa: F401
         from mjx_walk.envs.physics.mjx_jax import JaxEngine
 
         return JaxEngine(model, num_substeps, derived)

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from mjx_walk import mjx_without_warp  # noqa: F401
+from mjx_walk import mjx_import  # noqa: F401
 from mjx_walk.algos.a2c import A2CConfig, make_a2c
 from mjx_walk.algos.csac import CSACConfig, make_csac
 from mjx_walk.algos.ddpg import DDPGConfig, make_ddpg
