@@ -109,28 +109,30 @@ def test_editable(clone, tmp_path):
     assert python_use(tmp_path, executable=python).is_relative_to(clone)
 
 
+def printed(code, *paths):
+    """What a fresh interpreter prints, which finds the clone and then `paths`."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (CLONE, *paths)))}
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+
+
 @pytest.mark.parametrize("use", ["import mjx_walk.algos", "mjx_walk.make_env('walker2d', physics='jax')"])
 def test_where_warp_is_not_installed_mjx_does_not_say_so(use):
     code = f"import sys; sys.modules['warp'] = None; import mjx_walk; {use}; print(sys.modules['mujoco.mjx'].__name__)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=CLONE, capture_output=True, text=True, check=True)
-    assert done.stdout == "mujoco.mjx\n"
+    assert printed(code) == "mujoco.mjx\n"
 
 
 def test_the_c_engine_does_not_wait_for_mjx():
     code = "import mjx_walk, sys; mjx_walk.make_env('walker2d', physics='c'); print('mujoco.mjx' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=CLONE, capture_output=True, text=True, check=True)
-    assert done.stdout == "False\n"
+    assert printed(code) == "False\n"
 
 
 def test_mjx_is_not_searched_for_garbage():
     code = "import gc; from mjx_walk import mjx_import; print(gc.isenabled(), gc.get_freeze_count() > 100_000)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=CLONE, capture_output=True, text=True, check=True)
-    assert done.stdout == "True True\n"
+    assert printed(code) == "True True\n"
 
 
 def test_tensorboard_does_not_wait_for_pytorch(tmp_path):
     (tmp_path / "torch.py").write_text("print('PyTorch')\nclass Tensor: ...")
     code = "import mjx_walk.tensorboard; print('TensorBoard'); import torch"
-    environment = os.environ | {"PYTHONPATH": f"{CLONE}{os.pathsep}{tmp_path}"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout == "TensorBoard\nPyTorch\n"
+    assert printed(code, tmp_path) == "TensorBoard\nPyTorch\n"

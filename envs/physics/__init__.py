@@ -49,15 +49,16 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
         num_substeps: physics steps an environment step (Gymnasium's `frame_skip`).
         derived: the `mjData` arrays that the task reads.
     """
+    if name == "c":
+        from mjx_walk.envs.physics.mujoco_c import CEngine
+
+        return CEngine(model, num_substeps, derived)
+    from mjx_walk import mjx_import  # noqa: F401
+
     if name == "warp":
         from mjx_walk.envs.physics.mjx_warp import WarpEngine
 
         return WarpEngine(model, num_substeps, derived)
-    if name == "jax":
-        from mjx_walk import mjx_import  # noqa: F401
-        from mjx_walk.envs.physics.mjx_jax import JaxEngine
+    from mjx_walk.envs.physics.mjx_jax import JaxEngine
 
-        return JaxEngine(model, num_substeps, derived)
-    from mjx_walk.envs.physics.mujoco_c import CEngine
-
-    return CEngine(model, num_substeps, derived)
+    return JaxEngine(model, num_substeps, derived)
