@@ -16,11 +16,11 @@ import jax
 import jax.numpy as jnp
 
 from mjx_walk import cli, profile
-from mjx_walk.algos import ALGORITHMS, make_algorithm
+from mjx_walk.algos import make_algorithm
 from mjx_walk.api import make_task, resolve
 from mjx_walk.child_process import start_module
 from mjx_walk.config import Config
-from mjx_walk.envs import TASKS, State, Task
+from mjx_walk.envs import State, Task
 from mjx_walk.envs.physics import make_engine
 from mjx_walk.errors import UserError
 from mjx_walk.evaluation import versions
@@ -32,10 +32,9 @@ from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm
 
 USAGE = """
-usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [physics=auto] [num_envs=N] [seconds=5] [peers=false]
-                                [out=bench.json]
+usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [KEY=VALUE ...] [seconds=5] [peers=false] [out=bench.json]
 
-  num_envs   copies; by default those of the recipe for this hardware
+  KEY=VALUE  as for train: physics=jax num_envs=2048 algo.num_epochs=4; otherwise the recipe for this hardware
   seconds    how long each speed is measured
   peers      also Brax's PPO (algo=ppo) or SAC (algo=sac) on Brax's own, reduced humanoid: some minutes, most of
              them compiling
@@ -45,10 +44,6 @@ usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [physics=auto] [num_en
 
 @dataclasses.dataclass
 class Arguments:
-    env: str = setting("humanoid", choices=tuple(TASKS))
-    algo: str = setting("ppo", choices=tuple(ALGORITHMS))
-    physics: str = "auto"
-    num_envs: int | None = setting(None, at_least=1)
     seconds: float = setting(5.0, above=0)
     peers: bool = False
     out: str | None = None
@@ -56,13 +51,11 @@ class Arguments:
 
 def main(arguments: list[str]) -> None:
     """Measure, print a table, write JSON if asked."""
-    parsed = cli.parse(Arguments, arguments, USAGE)
-    if parsed.peers and parsed.algo not in ("ppo", "sac"):
-        raise UserError(f"Brax has no {parsed.algo} to compare with; leave peers out, or choose algo=ppo or algo=sac")
-    overrides = [f"env={parsed.env}", f"algo={parsed.algo}", f"physics={parsed.physics}"]
-    if parsed.num_envs:
-        overrides.append(f"num_envs={parsed.num_envs}")
+    parsed, overrides = cli.parse_own(Arguments, arguments, USAGE)
     config = resolve(overrides)
+    algo = config.algo.name
+    if parsed.peers and algo not in ("ppo", "sac"):
+        raise UserError(f"Brax has no {algo} to compare with; leave peers out, or choose algo=ppo or algo=sac")
     jax.config.update("jax_default_matmul_precision", config.matmul_precision)
     print("Two trainings of one chunk, in processes of their own …", flush=True)
     first_chunks = first_chunk_times(overrides)  # before this process takes the device's memory
@@ -92,11 +85,11 @@ def main(arguments: list[str]) -> None:
         report(name, value, unit)
     for name, value in peak_memory().items():
         report(name, value, "GiB")
-    if issubclass(ALGORITHMS[parsed.algo][1], OffPolicyConfig):
+    if isinstance(config.algo, OffPolicyConfig):
         for name, value in insert_times(task).items():
             report(name, value * 1e6, "µs")
     if parsed.peers:
-        for name, value, unit in peer_figures(parsed.algo, config.hardware):
+        for name, value, unit in peer_figures(algo, config.hardware):
             report(name, value, unit)
     if parsed.out:
         content = {"env": task.gymnasium_id, "device": device, "results": results, "versions": versions()}

@@ -44,7 +44,7 @@ def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False) ->
         path: folder to make; one that is there is replaced.
         tree: arrays of any dtype, or what `to_host` made of them.
         meta: JSON-able facts to keep beside it; version and checksums are added.
-        as_numpy: whether in one file of NumPy's instead of Orbax's folder.
+        as_numpy: whether in one file of NumPy's, compressed, instead of Orbax's folder.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
     meta = meta | {
@@ -219,7 +219,8 @@ def _is_replay(name: str) -> bool:
 def _write(path: Path, arrays: HostArrays, as_numpy: bool) -> None:
     if as_numpy or jax.process_index():  # Orbax writes arrays of the host from the first process alone
         path.mkdir()
-        np.savez(path / _NUMPY, allow_pickle=False, **arrays)
+        write = np.savez_compressed if as_numpy else np.savez
+        write(path / _NUMPY, allow_pickle=False, **arrays)
         return
     with _checkpointer() as checkpointer:
         checkpointer.save(path.absolute(), arrays)

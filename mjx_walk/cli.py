@@ -50,6 +50,18 @@ def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Argument
     return parsed
 
 
+def parse_own(schema: type[Arguments], arguments: list[str], usage: str) -> tuple[Arguments, list[str]]:
+    """The same of those arguments whose keys are the schema's; and the rest, which are a training's settings.
+
+    Raises:
+        UserError: a wrong type, or a value out of range.
+    """
+    own_keys = [field.name for field in dataclasses.fields(schema)] + ["-h", "--help"]  # type: ignore[arg-type]
+    own = [argument for argument in arguments if argument.partition("=")[0] in own_keys]
+    rest = [argument for argument in arguments if argument.partition("=")[0] not in own_keys]
+    return parse(schema, own, usage), rest
+
+
 def read_seeds(value: Any) -> list[int]:
     """`seeds=3` is 0, 1 and 2; `seeds=[3,7]` these.
 

@@ -44,10 +44,7 @@ class Arguments:
 
 def main(arguments: list[str]) -> int:
     """Run the cells that are not finished, and draw. Returns the exit code."""
-    own_keys = [field.name for field in dataclasses.fields(Arguments)]
-    is_own = [argument.partition("=")[0] in own_keys or argument in ("-h", "--help") for argument in arguments]
-    own = cli.parse(Arguments, [a for a, mine in zip(arguments, is_own, strict=True) if mine], USAGE)
-    overrides = [a for a, mine in zip(arguments, is_own, strict=True) if not mine]
+    own, overrides = cli.parse_own(Arguments, arguments, USAGE)
     if own.draw:
         if own.out is None:
             raise UserError("say which runs to draw: out=DIR")

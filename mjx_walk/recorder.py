@@ -78,16 +78,18 @@ class Recorder:
             self._filmer.take(policy_params, env_steps)
 
     def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:
-        """Begin to save the whole state; and the best policy, if it is a new one. Before the first evaluation is over,
-        the best policy is the present one."""
-        parts = [self._whole(state, env_steps, wall_seconds)]
+        """Begin to save the best policy, if it is a new one, and then the whole state, whose replay may take long.
+
+        Before the first evaluation is over, the best policy is the present one.
+        """
+        parts = []
         best = self._best_policy(state)
         if not best:
             parts.append((self._folder.best_policy, self._algorithm.policy_params(state), {"env_steps": env_steps}))
         elif int(state.env.live.best_update) != self._best_update:
             self._best_update = int(state.env.live.best_update)
             parts.append((self._folder.best_policy, *best))
-        self._saver.save(*parts)
+        self._saver.save(*parts, self._whole(state, env_steps, wall_seconds))
 
     def _whole(self, state: TrainState, env_steps: int, wall_seconds: float) -> tuple[Path, TrainState, dict[str, Any]]:
         """A checkpoint, as `BackgroundSaver.save` takes it."""

@@ -159,6 +159,21 @@ def test_ctrl_c_while_a_policy_is_scored_says_how_to_score_it(tmp_path, monkeypa
     assert command_here("eval", f"run={tmp_path / 'run'}", "episodes=2") == 0
 
 
+def test_a_save_that_is_cut_short_has_kept_the_best_policy(tmp_path, monkeypatch):
+    whole_save = checkpoint.save
+
+    def save(path, *arguments):
+        if path.name.isdigit():
+            raise OSError("No space left on device")
+        whole_save(path, *arguments)
+
+    monkeypatch.setattr(checkpoint, "save", save)
+    with pytest.raises(OSError, match="No space left"):
+        train_here(tmp_path / "run", f"total_steps={TINY_CHUNK}")
+    monkeypatch.undo()
+    assert command_here("eval", f"run={tmp_path / 'run'}", "episodes=1") == 0
+
+
 def test_a_gymnasium_process_whose_parent_is_gone_ends_quietly():
     worker = start_module("gymnasium_worker", stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     pickle.dump(("Walker2d-v5", {}, [0]), worker.stdin)

@@ -1,6 +1,9 @@
 """`python -m mjx_walk.zoo`: list the policies that come with the package; for its authors: put a run's among them."""
 
 import dataclasses
+from typing import Any
+
+import jax
 
 from mjx_walk import checkpoint, cli, run_folder, zoo
 from mjx_walk.api import load_run
@@ -33,6 +36,7 @@ def main(arguments: list[str]) -> None:
         raise UserError("say under which name: name=humanoid-ppo")
     source = run_folder.open_existing(parsed.add)
     run = load_run(source.path, "auto")
+    run.policy_params = _rounded_to(run.config.algo.network_dtype, run.policy_params)
     scores = run.evaluate()
     folder = RunFolder(zoo.empty_folder(parsed.name))
     config = dataclasses.replace(run.config, physics="auto", run_dir=None, resume=False)
@@ -41,6 +45,12 @@ def main(arguments: list[str]) -> None:
     checkpoint.save(folder.best_policy, run.policy_params, facts, as_numpy=True)
     scores.save(folder.gymnasium_scores, command=_command(config), **facts)
     print(scores)
+
+
+def _rounded_to(dtype: str, policy_params: Any) -> Any:
+    """A policy whose weights have the precision they were trained with: half the bytes of bfloat16's are zeros."""
+    normalizer, params = policy_params
+    return normalizer, jax.tree.map(lambda x: x.astype(dtype).astype(x.dtype), params)
 
 
 def _command(config) -> str:
