@@ -20,6 +20,7 @@ from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.envs.rewards import reward_file
 from mjx_walk.errors import UserError
 from mjx_walk.evaluation import Scores, score_in_gymnasium, score_in_sim
+from mjx_walk.interrupt import as_by_ctrl_c
 from mjx_walk.loop import Trainer
 from mjx_walk.metrics import Row, read_rows
 from mjx_walk.policies import deterministic_act, load_best_policy
@@ -153,23 +154,24 @@ def train(
         path = team.first_ones(str(folders[0].path.absolute()) if is_first else "")
         folders = [RunFolder(Path(path))]
     trainer = Trainer(configs, task, folders, on_metrics, team)
-    signal_name = trainer.train()
-    if signal_name and is_first:
-        where = f"run_dir={folders[0].path}"
-        if len(folders) > 1:
-            where = f"run_dir={folders[0].path.parent} 'seeds={[config.seed for config in configs]}'"
-        print(
-            f"Stopped by {signal_name} and saved. To go on: python -m mjx_walk.train {where} resume=true",
-            flush=True,
-        )
-    elif not signal_name:
-        try:
-            trainer.score()
-        except KeyboardInterrupt:
-            for folder in folders:
-                if not folder.gymnasium_scores.exists():
-                    print(f"Trained and saved, not scored. To score: python -m mjx_walk.eval run={folder.path}")
-            raise
+    with as_by_ctrl_c():
+        signal_name = trainer.train()
+        if signal_name and is_first:
+            where = f"run_dir={folders[0].path}"
+            if len(folders) > 1:
+                where = f"run_dir={folders[0].path.parent} 'seeds={[config.seed for config in configs]}'"
+            print(
+                f"Stopped by {signal_name} and saved. To go on: python -m mjx_walk.train {where} resume=true",
+                flush=True,
+            )
+        elif not signal_name:
+            try:
+                trainer.score()
+            except KeyboardInterrupt:
+                for folder in folders:
+                    if not folder.gymnasium_scores.exists():
+                        print(f"Trained and saved, not scored. To score: python -m mjx_walk.eval run={folder.path}")
+                raise
     return folders, signal_name
 
 

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mjx_walk.errors import UserError
-from mjx_walk.interrupt import exit_code
+from mjx_walk.interrupt import Stopped, exit_code
 from mjx_walk.settings import validate
 
 Arguments = TypeVar("Arguments")
@@ -96,6 +96,9 @@ def main(command: Callable[[list[str]], int | None]) -> NoReturn:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except Stopped as stopped:
+        print(f"Stopped by {stopped.signal_name}.", file=sys.stderr)
+        sys.exit(exit_code(stopped.signal_name))
     except KeyboardInterrupt:
         print("Stopped by Ctrl-C.", file=sys.stderr)
         sys.exit(exit_code("SIGINT"))

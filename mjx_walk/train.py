@@ -16,7 +16,7 @@ from mjx_walk import cli, launch
 from mjx_walk.api import resolve, resolve_seeds, train
 from mjx_walk.config import CONFIG_DIR, complete_overrides, load_config, register_schemas, to_config
 from mjx_walk.errors import UserError
-from mjx_walk.interrupt import exit_code
+from mjx_walk.interrupt import Stopped, exit_code
 from mjx_walk.team import Team, join
 
 USAGE = """
@@ -75,9 +75,9 @@ def _train_in_team(settings: list[str], team: Team) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         os._exit(2)
-    except KeyboardInterrupt:  # while it is scored, or the second one; what is saved is said already
+    except KeyboardInterrupt as stop:  # while it is scored, or the second one; what is saved is said already
         sys.stdout.flush()
-        os._exit(exit_code("SIGINT"))
+        os._exit(exit_code(stop.signal_name if isinstance(stop, Stopped) else "SIGINT"))
     except BaseException:
         traceback.print_exc()
         sys.stderr.flush()

@@ -146,15 +146,17 @@ def test_signals_finish_the_chunk_save_and_say_how_to_go_on(tmp_path, name):
     assert resolve([f"run_dir={run_dir}", "resume=true"]).env.name == "walker2d"
 
 
-def test_ctrl_c_while_a_policy_is_scored_says_how_to_score_it(tmp_path, monkeypatch, capsys):
-    def ctrl_c(*_):
-        raise KeyboardInterrupt
+@pytest.mark.parametrize(("name", "shown"), [("SIGINT", "Ctrl-C"), ("SIGTERM", "SIGTERM")])
+def test_a_signal_while_a_policy_is_scored_says_how_to_score_it(tmp_path, monkeypatch, capsys, name, shown):
+    def score(*_):
+        signal.raise_signal(signal.Signals[name])
 
-    monkeypatch.setattr("mjx_walk.recorder.score_in_gymnasium", ctrl_c)
+    monkeypatch.setattr("mjx_walk.recorder.score_in_gymnasium", score)
     whole = (*TINY, "evaluation.gymnasium_episodes=2", f"total_steps={TINY_CHUNK}", f"run_dir={tmp_path / 'run'}")
-    assert command_here("train", *whole) == 130
+    assert command_here("train", *whole) == 128 + signal.Signals[name]
     said = capsys.readouterr()
-    assert f"python -m mjx_walk.eval run={tmp_path / 'run'}" in said.out and "Stopped by Ctrl-C." in said.err
+    assert f"python -m mjx_walk.eval run={tmp_path / 'run'}" in said.out and f"Stopped by {shown}." in said.err
+    assert [int(path.name) for path in checkpoint.list_steps(tmp_path / "run" / "checkpoints")] == [TINY_CHUNK]
     monkeypatch.undo()
     assert command_here("eval", f"run={tmp_path / 'run'}", "episodes=2") == 0
 
