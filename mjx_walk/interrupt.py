@@ -6,8 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 
-_OTHERS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR1") if hasattr(signal, name))
-"""Than Ctrl-C's, SIGINT."""
+_FROM_SCHEDULERS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR1") if hasattr(signal, name))
 
 
 class Interrupt:
@@ -16,7 +15,7 @@ class Interrupt:
     def __init__(self, doing: str = "finishing this chunk, then saving") -> None:
         self._doing = doing
         self.signal_name: str | None = None
-        self._handled = _handled_by(self._note, signal.SIGINT, *_OTHERS)
+        self._handled = _handled_by(self._note, signal.SIGINT, *_FROM_SCHEDULERS)
 
     def __enter__(self) -> "Interrupt":
         self._handled.__enter__()
@@ -50,7 +49,7 @@ def as_by_ctrl_c() -> contextlib.AbstractContextManager[None]:
     def stop(number: int, _) -> None:
         raise Stopped(signal.Signals(number).name)
 
-    return _handled_by(stop, *_OTHERS)
+    return _handled_by(stop, *_FROM_SCHEDULERS)
 
 
 @contextlib.contextmanager

@@ -48,7 +48,7 @@ def main(arguments: list[str]) -> None:
 
 
 def _rounded_to(dtype: str, policy_params: Any) -> Any:
-    """A policy whose weights have the precision they were trained with: half the bytes of bfloat16's are zeros."""
+    """A policy with weights of the precision that its networks learned with: half the bytes of bfloat16 are zeros."""
     normalizer, params = policy_params
     return normalizer, jax.tree.map(lambda x: x.astype(dtype).astype(x.dtype), params)
 
