@@ -68,6 +68,8 @@ class Parity:
     """Steps that ended an episode in the reference."""
     termination_mismatches: int
     overflows: int
+    nonfinite: int
+    """Steps whose physics broke in the engine; the state before them is kept, and each counts as terminated."""
 
     @property
     def is_within(self) -> bool:
@@ -129,6 +131,7 @@ def compare(task: Task, expected: State, found: State) -> Parity:
         num_terminations=int(expected.terminated.sum()),
         termination_mismatches=int((expected.terminated != found.terminated).sum()),
         overflows=int(found.metrics["overflow"].sum()),
+        nonfinite=int(found.metrics["nonfinite"].sum()),
     )
 
 
@@ -161,7 +164,7 @@ def main(arguments: list[str]) -> int:
         print(*parity.errors, sep="\n")
         print(
             f"  {parity.num_terminations} terminations, {parity.termination_mismatches} mismatches; "
-            f"{parity.overflows} overflows",
+            f"{parity.overflows} overflows, {parity.nonfinite} not finite",
             flush=True,
         )
         is_within &= parity.is_within
