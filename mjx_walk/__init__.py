@@ -4,6 +4,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from mjx_walk.registration import register
+from mjx_walk.xla_flags import turn_off_wrong_reductions
 
 __version__ = "0.1.0"
 __all__ = ["__version__", "load_run", "make_env", "run"]
@@ -22,4 +23,5 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'mjx_walk' has no attribute '{name}'")
 
 
+turn_off_wrong_reductions()
 register()

@@ -33,6 +33,14 @@ def test_parity_of_all_versions(name, version, physics):
     assert found.is_within, "\n".join(map(str, found.errors))
 
 
+def test_parity_where_new_memory_holds_no_zeros():
+    """On a CPU, reductions over a batch of this size read memory that was never written, without `xla_flags`."""
+    sizes = ("env=humanoid_standup", "copies=48", "steps=120")
+    done = command("parity", "physics=jax", *sizes, env={"MALLOC_PERTURB_": "128"})
+    assert done.returncode == 0, done.stdout
+    assert "0 not finite" in done.stdout
+
+
 OWN = {
     "ppo": ("algo.num_minibatches=4", "algo.num_epochs=2"),
     "sac": ("algo.updates_per_step=1", "algo.batch_size=64", "algo.prefill_steps=256", "updates_per_chunk=1"),
