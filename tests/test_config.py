@@ -44,10 +44,10 @@ def test_the_reports_recipes_name_their_own_task_and_algorithm(name):
         assert config.evaluation.num_envs == 10 and algorithm.steps_per_update == config.num_envs
 
 
-def test_the_recipe_for_speed_gathers_twice_as_many_steps_and_goes_through_them_half_as_often():
+def test_the_recipe_for_speed_gathers_four_times_the_steps_and_goes_through_them_half_as_often():
     usual, fast = (load_config(["hardware=gpu", f"recipe={folder}/humanoid_ppo"]) for folder in ("gpu", "speed"))
     algorithms = [make_algorithm(make_task(c), c.num_envs, c.evaluation, c.algo) for c in (usual, fast)]
-    assert algorithms[1].steps_per_update == 2 * algorithms[0].steps_per_update
+    assert algorithms[1].steps_per_update == 4 * algorithms[0].steps_per_update
     assert 2 * fast.algo.num_epochs == usual.algo.num_epochs and fast.algo.schedule_steps == fast.total_steps
 
 
