@@ -4,38 +4,36 @@ import dataclasses
 import json
 import resource
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from subprocess import STDOUT
 from typing import Any
 
 import gymnasium
 import jax
 import jax.numpy as jnp
 
-from mjx_walk import cli, profile
+from mjx_walk import cli, launch, profile, trial_runs
 from mjx_walk.algos import make_algorithm
 from mjx_walk.api import make_task, resolve
-from mjx_walk.child_process import start_module
 from mjx_walk.config import Config
 from mjx_walk.envs import State, Task
 from mjx_walk.envs.physics import make_engine
 from mjx_walk.errors import UserError
 from mjx_walk.evaluation import versions
 from mjx_walk.loop import make_chunk, make_init
-from mjx_walk.metrics import read_rows
 from mjx_walk.off_policy import OffPolicyConfig
 from mjx_walk.replay import ReplayBuffer, Steps
 from mjx_walk.settings import setting
 from mjx_walk.types import Algorithm
 
 USAGE = """
-usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [KEY=VALUE ...] [seconds=5] [peers=false] [out=bench.json]
+usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [KEY=VALUE ...] [seconds=5] [devices=all] [peers=false]
+                                [out=bench.json]
 
   KEY=VALUE  as for train: physics=jax num_envs=2048 algo.num_epochs=4; otherwise the recipe for this hardware
   seconds    how long each speed is measured
+  devices    also training on 1, 2, 4 … GPUs of this host, up to so many: a process and num_envs copies each
   peers      also Brax's PPO (algo=ppo) or SAC (algo=sac) on Brax's own, reduced humanoid: some minutes, most of
              them compiling
   out        the table as JSON, with versions
@@ -45,6 +43,7 @@ usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [KEY=VALUE ...] [secon
 @dataclasses.dataclass
 class Arguments:
     seconds: float = setting(5.0, above=0)
+    devices: Any = None
     peers: bool = False
     out: str | None = None
 
@@ -57,8 +56,11 @@ def main(arguments: list[str]) -> None:
     if parsed.peers and algo not in ("ppo", "sac"):
         raise UserError(f"Brax has no {algo} to compare with; leave peers out, or choose algo=ppo or algo=sac")
     jax.config.update("jax_default_matmul_precision", config.matmul_precision)
-    print("Two trainings of one chunk, in processes of their own …", flush=True)
-    first_chunks = first_chunk_times(overrides)  # before this process takes the device's memory
+    sizes = device_counts(parsed.devices)
+    print("Short trainings, in processes of their own …", flush=True)
+    # Before this process takes the device's memory.
+    first_chunks = trial_runs.first_chunk_times(overrides)
+    speeds = trial_runs.speeds_by_devices(overrides, sizes, parsed.seconds)
     task = make_task(config)
     device = f"{jax.devices()[0].device_kind}, physics={task.engine.name}, {config.num_envs} copies"
     print(f"{task.gymnasium_id} on {device}", flush=True)
@@ -69,7 +71,11 @@ def main(arguments: list[str]) -> None:
         print(f"  {name:<44} {value:>12,.1f} {unit}", flush=True)
 
     for name, value in first_chunks.items():
-        report(name, value, "s")
+        report(f"compile and first chunk, {name} caches", value, "s")
+    for size, speed in speeds.items():
+        report(f"training on {size} {'device' if size == 1 else 'devices'}", speed, "env-steps/s")
+        if size > 1:
+            report(f"  times that on 1, of {size}", speed / speeds[1], "times")
     gym_speed = gymnasium_speed(task, parsed.seconds)
     report("Gymnasium, one core", gym_speed, "env-steps/s")
     for name, measure in {
@@ -94,6 +100,18 @@ def main(arguments: list[str]) -> None:
     if parsed.out:
         content = {"env": task.gymnasium_id, "device": device, "results": results, "versions": versions()}
         Path(parsed.out).write_text(json.dumps(content, indent=1))
+
+
+def device_counts(asked: Any) -> list[int]:
+    """1, 2, 4 … and how many are asked for; none if that is unset.
+
+    Raises:
+        UserError: this host has fewer GPUs.
+    """
+    if asked is None:
+        return []
+    most = launch.count(asked)
+    return sorted({most} | {2**power for power in range(most.bit_length()) if 2**power <= most})
 
 
 def gymnasium_speed(task: Task, seconds: float) -> float:
@@ -144,41 +162,6 @@ def physics_speed(task: Task, num_envs: int, seconds: float) -> float:
 def step_speed(task: Task, num_envs: int, seconds: float) -> float:
     """The same with observation, reward and termination."""
     return _speed_under_random_actions(task, num_envs, seconds, lambda state: state, jax.vmap(task.step))
-
-
-def first_chunk_times(overrides: list[str]) -> dict[str, float]:
-    """Seconds from the trainer's start to the end of its first chunk, without and with what JAX and Warp cache.
-
-    Each in a process of its own: Warp numbers its calls within a process, and the numbers are part of JAX's programs,
-    so that a process never finds its own ones again.
-
-    Raises:
-        UserError: training refuses these settings.
-        RuntimeError: it failed.
-    """
-    times = {}
-    with tempfile.TemporaryDirectory() as folder:
-        places = {"JAX_COMPILATION_CACHE_DIR": f"{folder}/jax", "WARP_CACHE_PATH": f"{folder}/warp"}
-        for name in ("cold", "warm"):
-            run_dir = Path(folder, name)
-            output = Path(folder, f"{name}.txt")
-            whole = [*overrides, "total_steps=1", "evaluation.gymnasium_episodes=0", f"run_dir={run_dir}"]
-            with (
-                output.open("w") as file,
-                start_module("train", *whole, env=places, stdout=file, stderr=STDOUT) as process,
-            ):
-                try:
-                    while process.poll() is None and not read_rows(run_dir / "metrics.jsonl"):
-                        time.sleep(0.1)
-                finally:
-                    process.kill()  # before it has written a replay to the disk
-            rows = read_rows(run_dir / "metrics.jsonl")
-            if not rows and process.returncode == 2:
-                raise UserError(output.read_text().splitlines()[-1].removeprefix("error: "))
-            if not rows:
-                raise RuntimeError(f"train {' '.join(whole)}: {output.read_text()}")
-            times[f"compile and first chunk, {name} caches"] = rows[0]["wall_seconds"]
-    return times
 
 
 def training_speed(config: Config, algorithm: Algorithm, fused: bool, seconds: float) -> float:

@@ -7,13 +7,14 @@ import jax.numpy as jnp
 import pytest
 from commands import command, command_here
 
+from mjx_walk.bench import device_counts
 from mjx_walk.profile import matmul_flops
 
 
-@pytest.mark.parametrize("algo", ["ppo", pytest.param("td3", marks=pytest.mark.slow)])
-def test_bench_measures_and_writes(tmp_path, algo):
+@pytest.mark.parametrize(("algo", "sizes"), [("ppo", []), pytest.param("td3", [1, 2], marks=pytest.mark.slow)])
+def test_bench_measures_and_writes(tmp_path, algo, sizes):
     arguments = ("env=walker2d", f"algo={algo}", "num_envs=32", "seconds=0.5", f"out={tmp_path}/bench.json")
-    done = command("bench", *arguments)
+    done = command("bench", *arguments, *(f"devices={size}" for size in sizes[-1:]))
     assert done.returncode == 0, done.stderr
     content = json.loads((tmp_path / "bench.json").read_text())
     results = content["results"]
@@ -24,6 +25,10 @@ def test_bench_measures_and_writes(tmp_path, algo):
     inserts = [value for name, value in results.items() if name.startswith("insert of 4,096 transitions")]
     assert len(inserts) == (2 if algo == "td3" else 0) and all(value > 0 for value in inserts)
     assert all(results[f"compile and first chunk, {name} caches"] > 0 for name in ("cold", "warm"))
+    on = [results[name] for name in results if name.startswith("training on ")]
+    assert len(on) == len(sizes) and all(speed > 10 for speed in on)
+    if sizes:
+        assert results["  times that on 1, of 2"] == on[1] / on[0]
     assert results["peak memory, host"] > 0.1
     assert content["env"] == "Walker2d-v5" and content["versions"]["mujoco"] and "32 copies" in content["device"]
 
@@ -31,6 +36,12 @@ def test_bench_measures_and_writes(tmp_path, algo):
 def test_a_mistake_in_the_settings_costs_one_line(capsys):
     assert command_here("bench", "env=walker2d", "num_envs=3") == 2
     assert capsys.readouterr().err.startswith("error: num_envs=3 times algo.num_unrolls=1 does not divide")
+
+
+def test_devices_are_doubled_up_to_those_asked_for(capsys):
+    assert [device_counts(asked) for asked in (None, 1, 4, 6)] == [[], [1], [1, 2, 4], [1, 2, 4, 6]]
+    assert command_here("bench", "env=walker2d", "devices=0") == 2
+    assert capsys.readouterr().err.startswith("error: devices=0: write devices=all, or a number")
 
 
 def test_products_are_counted():
