@@ -111,7 +111,7 @@ def device_counts(asked: Any) -> list[int]:
     if asked is None:
         return []
     most = launch.count(asked)
-    return sorted({most} | {2**power for power in range(most.bit_length()) if 2**power <= most})
+    return sorted({most} | {2**power for power in range(most.bit_length())})
 
 
 def gymnasium_speed(task: Task, seconds: float) -> float:
@@ -165,7 +165,7 @@ def step_speed(task: Task, num_envs: int, seconds: float) -> float:
 
 
 def training_speed(config: Config, algorithm: Algorithm, fused: bool, seconds: float) -> float:
-    """Steps per second of training end to end, as the loop runs it."""
+    """Steps per second of the chunks that the loop runs, one after the other; nothing is logged or saved."""
     chunk = make_chunk(algorithm, config.updates_per_chunk, fused)
     state = make_init(algorithm)(jax.random.PRNGKey(0))
     steps_per_chunk = algorithm.steps_per_update * config.updates_per_chunk

@@ -75,16 +75,14 @@ def _rows_of(
             output.open("w") as file,
             start_module("train", *whole, env=env, stdout=file, stderr=STDOUT) as process,
         ):
-            rows: list[Row] = []
             try:
-                while process.poll() is None and not are_enough(rows):
+                # It lives on for a while after its last row, which is therefore seen.
+                while not are_enough(rows := read_rows(run_dir / "metrics.jsonl")) and process.poll() is None:
                     time.sleep(0.1)
-                    rows = read_rows(run_dir / "metrics.jsonl")
             finally:
                 process.send_signal(last_signal)
-        rows = rows or read_rows(run_dir / "metrics.jsonl")
-        if not are_enough(rows) and process.returncode == 2:
+        if are_enough(rows):
+            return rows
+        if process.returncode == 2:
             raise UserError(output.read_text().splitlines()[-1].removeprefix("error: "))
-        if not are_enough(rows):
-            raise RuntimeError(f"train {' '.join(whole)}: {output.read_text()}")
-        return rows
+        raise RuntimeError(f"train {' '.join(whole)}: {output.read_text()}")
