@@ -66,6 +66,8 @@ class TaskOptions:
         for field in dataclasses.fields(self):  # a range comes as a list from a configuration file
             if isinstance(getattr(self, field.name), list):
                 setattr(self, field.name, tuple(getattr(self, field.name)))
+        if self.xml_file and _model_path(self.xml_file).is_file():
+            self.xml_file = str(_model_path(self.xml_file).resolve())  # also from another folder
         if isinstance(self.shaping, dict):
             unknown = self.shaping.keys() - {field.name for field in dataclasses.fields(Shaping)}
             if unknown:
@@ -133,14 +135,11 @@ class Task(abc.ABC):
         """Keywords for `gymnasium.make` that give the same task; those at their default are left out."""
         defaults = type(self.options)()
         not_theirs = {"name", "version", "max_episode_steps", "shaping", "reward_function"}
-        kwargs = {
+        return {
             field.name: getattr(self.options, field.name)
             for field in dataclasses.fields(self.options)
             if field.name not in not_theirs and getattr(self.options, field.name) != getattr(defaults, field.name)
         }
-        if kwargs.get("xml_file"):
-            kwargs["xml_file"] = str(Path(kwargs["xml_file"]).expanduser().resolve())
-        return kwargs
 
     @property
     def has_own_reward(self) -> bool:
@@ -268,15 +267,21 @@ def _is_sound(arrays, limit: float = MAX_ABS_VALUE) -> jax.Array:
     return jnp.array([jnp.all(jnp.abs(x) < limit) for x in arrays]).all()
 
 
+def _model_path(xml_file: str) -> Path:
+    """By the rules of Gymnasium's `xml_file`: a bare name is one of its assets, else it is a path."""
+    path = Path(xml_file).expanduser()
+    if len(path.parts) == 1 and not path.exists():
+        return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / xml_file
+    return path
+
+
 def load_model(xml_file: str) -> mujoco.MjModel:
-    """Load a model by the rules of Gymnasium's `xml_file`: a bare name is one of its assets, else it is a path.
+    """Load a model, one of Gymnasium's or one's own.
 
     Raises:
         UserError: there is no such file, or MuJoCo cannot read it.
     """
-    path = Path(xml_file).expanduser()
-    if len(path.parts) == 1 and not path.exists():
-        path = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / xml_file
+    path = _model_path(xml_file)
     if not path.is_file():
         raise UserError(f"model file not found: {path}")
     try:

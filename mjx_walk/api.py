@@ -25,7 +25,7 @@ from mjx_walk.loop import Trainer
 from mjx_walk.metrics import Row, read_rows
 from mjx_walk.policies import deterministic_act, load_best_policy
 from mjx_walk.rendering import choose_opengl
-from mjx_walk.run_folder import MAY_DIFFER, RunFolder
+from mjx_walk.run_folder import RunFolder
 from mjx_walk.team import Team
 from mjx_walk.wandb_log import require_wandb
 
@@ -44,9 +44,7 @@ class Run:
         """
         self.path = folder.path
         self.config = _without_lost_reward(read_config(folder.config))
-        engine = physics or self.config.physics
-        if physics is None and engine == "c" and jax.default_backend() != "cpu":
-            engine = "auto"
+        engine = physics or _engine_here(self.config.physics)
         self.task = make_task(dataclasses.replace(self.config, physics=engine))
         # It acts in float32, whatever it learned in: the same on every machine.
         algo = dataclasses.replace(self.config.algo, network_dtype="float32")
@@ -190,12 +188,12 @@ def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | 
 
 
 def _as_saved(config: Config, overrides: list[str]) -> Config:
-    """A run's own configuration, if nothing but its folder was given to resume it."""
+    """A run's own configuration, with the settings that were given to resume it, unless those say which run it is."""
     given = {override.partition("=")[0] for override in overrides}
-    if not (config.resume and config.run_dir and given <= {*MAY_DIFFER, "hardware"}):
+    if not (config.resume and config.run_dir) or given & {"env", "algo", "recipe"}:
         return config
     saved = read_config(run_folder.open_existing(config.run_dir).config)
-    for key in given & {*MAY_DIFFER} | {"run_dir", "resume"}:
+    for key in given - {"hardware"} | {"run_dir", "resume"}:
         saved = _with_setting(saved, key, operator.attrgetter(key)(config))
     return saved
 
@@ -205,6 +203,14 @@ def _with_setting(settings: Any, key: str, value: Any) -> Any:
     name, _, rest = key.partition(".")
     own = _with_setting(getattr(settings, name), rest, value) if rest else value
     return dataclasses.replace(settings, **{name: own})
+
+
+def _engine_here(name: str) -> str:
+    """The engine that a run was trained on, or this machine's own, where that one does not run."""
+    try:
+        return resolve_engine(name)
+    except UserError:
+        return "auto"
 
 
 def _without_lost_reward(config: Config) -> Config:
@@ -225,6 +231,13 @@ def _announce(config: Config, folders: list[RunFolder], num_devices: int) -> Non
         print(
             "No accelerator: the CPU-sized recipe, with MuJoCo's C library unless another engine was asked for. "
             "Expect minutes to tens of minutes to a gait; recipes for a GPU reach much higher scores.",
+        )
+    algo = config.algo
+    if algo.learning_rate_schedule != "constant" and config.total_steps > algo.schedule_steps:
+        print(
+            f"warning: from algo.schedule_steps={algo.schedule_steps} on the learning rate is zero; to learn until "
+            f"total_steps={config.total_steps} give algo.schedule_steps={config.total_steps}, too",
+            file=sys.stderr,
         )
     if config.physics == "warp":
         print("Warp compiles its kernels on the first run of a machine, which takes about a minute.")

@@ -50,12 +50,14 @@ class Arguments:
 
 def main(arguments: list[str]) -> None:
     """Measure, print a table, write JSON if asked."""
-    parsed, overrides = cli.parse_own(Arguments, arguments, USAGE)
+    parsed, overrides = cli.parse_own(Arguments, Config, arguments, USAGE)
     config = resolve(overrides)
     algo = config.algo.name
     if parsed.peers and algo not in ("ppo", "sac"):
         raise UserError(f"Brax has no {algo} to compare with; leave peers out, or choose algo=ppo or algo=sac")
     jax.config.update("jax_default_matmul_precision", config.matmul_precision)
+    if parsed.out:
+        cli.check_writable(Path(parsed.out))
     sizes = device_counts(parsed.devices)
     print("Short trainings, in processes of their own …", flush=True)
     # Before this process takes the device's memory.

@@ -60,8 +60,12 @@ def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False) ->
     if replay:
         _write(unfinished / _REPLAY, replay, as_numpy)
     (unfinished / _META).write_text(json.dumps(meta))
-    shutil.rmtree(path, ignore_errors=True)
+    former = path.with_name(f".{path.name}.former")
+    shutil.rmtree(former, ignore_errors=True)
+    if path.exists():
+        os.replace(path, former)  # at once, which removing a folder is not
     os.replace(unfinished, path)
+    shutil.rmtree(former, ignore_errors=True)
 
 
 def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:

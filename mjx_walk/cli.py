@@ -1,12 +1,15 @@
 """What all commands share: `key=value` arguments, and one line and exit code 2 for a user's mistake."""
 
 import dataclasses
+import difflib
+import errno
 import sys
 import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+import jax
 import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -50,15 +53,31 @@ def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Argument
     return parsed
 
 
-def parse_own(schema: type[Arguments], arguments: list[str], usage: str) -> tuple[Arguments, list[str]]:
+def parse_own(
+    schema: type[Arguments], others: type[Any], arguments: list[str], usage: str
+) -> tuple[Arguments, list[str]]:
     """The same of those arguments whose keys are the schema's; and the rest, which are a training's settings.
 
+    Args:
+        schema: as for `parse`.
+        others: dataclass of the training's settings.
+        arguments: as on the command line.
+        usage: printed for `--help`.
+
     Raises:
-        UserError: a wrong type, or a value out of range.
+        UserError: a wrong type, a value out of range, or a key that looks like one of the schema's.
     """
-    own_keys = [field.name for field in dataclasses.fields(schema)] + ["-h", "--help"]  # type: ignore[arg-type]
-    own = [argument for argument in arguments if argument.partition("=")[0] in own_keys]
-    rest = [argument for argument in arguments if argument.partition("=")[0] not in own_keys]
+    own_keys, other_keys = ([field.name for field in dataclasses.fields(kind)] for kind in (schema, others))  # type: ignore[arg-type]
+    own: list[str] = []
+    rest: list[str] = []
+    for argument in arguments:
+        key = argument.partition("=")[0]
+        is_own = key in (*own_keys, "-h", "--help")
+        (own if is_own else rest).append(argument)
+        near = difflib.get_close_matches(key, own_keys + other_keys)
+        is_known = is_own or key.lstrip("+~") in other_keys or "." in key or "/" in key
+        if {*own_keys} & {*near} and not is_known:
+            raise UserError(f"unknown key '{key}'; did you mean: {', '.join(near)}?")
     return parse(schema, own, usage), rest
 
 
@@ -81,19 +100,49 @@ def check_writable(path: Path) -> None:
     Raises:
         UserError: nothing can be written there.
     """
+    is_new = not path.exists()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab"):
             pass
+        if is_new:
+            path.unlink()
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
+def check_suffix(path: Path | None, *suffixes: str) -> None:
+    """Before work is done for a file.
+
+    Raises:
+        UserError: it is of a kind that is not written.
+    """
+    if path and path.suffix.lower() not in suffixes:
+        raise UserError(f"{path}: give it one of these endings: {', '.join(suffixes)}")
+
+
+def stay_on_cpu() -> None:
+    """For a command that steps environments one by one with MuJoCo's C library, also where JAX would take a GPU.
+
+    It has no effect on a process that has used JAX before.
+    """
+    jax.config.update("jax_platforms", "cpu")
+
+
+_DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
+
+
 def main(command: Callable[[list[str]], int | None]) -> NoReturn:
-    """Run a command on the process's arguments and exit with its code; a mistake or Ctrl-C costs one line."""
+    """Run a command on the process's arguments and exit with its code; a mistake, a disk that is full or must not be
+    written to, and Ctrl-C cost one line."""
     try:
         sys.exit(command(sys.argv[1:]) or 0)
     except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except OSError as error:
+        if error.errno not in _DISK_TROUBLE:
+            raise
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except Stopped as stopped:

@@ -9,6 +9,7 @@ from typing import Any
 from mjx_walk import cells, cli
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.comparison import write_report
+from mjx_walk.config import Config
 from mjx_walk.errors import UserError
 from mjx_walk.interrupt import exit_code
 from mjx_walk.settings import setting
@@ -44,7 +45,7 @@ class Arguments:
 
 def main(arguments: list[str]) -> int:
     """Run the cells that are not finished, and draw. Returns the exit code."""
-    own, overrides = cli.parse_own(Arguments, arguments, USAGE)
+    own, overrides = cli.parse_own(Arguments, Config, arguments, USAGE)
     if own.draw:
         if own.out is None:
             raise UserError("say which runs to draw: out=DIR")

@@ -12,6 +12,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -125,9 +126,18 @@ def complete_overrides(overrides: list[str]) -> list[str]:
         known = {"env": TASKS, "algo": ALGORITHMS}.get(key)
         if known and not override.is_sweep_override() and override.value() not in known:
             raise UserError(f"unknown {key} '{override.value()}'; choose one of: {', '.join(known)}")
+    overrides = [_as_text(override) for override in parsed]
     if not any(override.key_or_group == "hardware" for override in parsed):
         overrides = [f"hardware={'cpu' if jax.default_backend() == 'cpu' else 'gpu'}", *overrides]
     return overrides
+
+
+def _as_text(override: Override) -> str:
+    """As it was written; what is a text in quotes, since Hydra would read the folder 2026_11_23 as a number."""
+    key, line = override.key_or_group, str(override.input_line)
+    if key in ("run_dir", "wandb_project") and isinstance(override.value(), (bool, int, float)):
+        return f"{key}='{line.partition('=')[2]}'"
+    return line
 
 
 def flatten(config: Config) -> dict[str, Any]:

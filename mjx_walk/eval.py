@@ -28,10 +28,13 @@ def main(arguments: list[str]) -> None:
     parsed = cli.parse(Arguments, arguments, USAGE)
     folder = run_folder.open_existing(parsed.run)
     run = load_run(folder.path, parsed.physics)
+    is_kept = parsed.backend == "gymnasium" and not zoo.holds(folder.path)
+    if is_kept:
+        cli.check_writable(folder.gymnasium_scores)
     scores = run.evaluate(parsed.episodes, parsed.backend, parsed.seed)
-    if parsed.backend == "gymnasium" and not zoo.holds(folder.path):
-        scores.save(folder.gymnasium_scores, env_steps=run.policy_facts["env_steps"])
     print(scores)
+    if is_kept:
+        scores.save(folder.gymnasium_scores, env_steps=run.policy_facts["env_steps"])
 
 
 if __name__ == "__main__":

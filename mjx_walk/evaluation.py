@@ -76,6 +76,10 @@ def versions() -> dict[str, str]:
     return found
 
 
+_MOST_SIDE_BY_SIDE = 1024
+"""Episodes that are played at once: an environment takes about 1 MB."""
+
+
 def score_in_gymnasium(task: Task, act: Callable[[np.ndarray], np.ndarray], num_episodes: int, seed: int = 0) -> Scores:
     """Whole episodes in `gymnasium.make`: CPU MuJoCo, float64, the model's own solver.
 
@@ -87,11 +91,20 @@ def score_in_gymnasium(task: Task, act: Callable[[np.ndarray], np.ndarray], num_
         num_episodes: N.
         seed: episode i is reset with `seed + i`.
     """
-    keywords = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
     seeds = [seed + i for i in range(num_episodes)]
-    returns, lengths = np.zeros(num_episodes), np.zeros(num_episodes, np.int64)
-    is_over = np.zeros(num_episodes, bool)
-    shares = [share for share in np.array_split(np.arange(num_episodes), os.cpu_count() or 1) if share.size]
+    rounds = [seeds[i : i + _MOST_SIDE_BY_SIDE] for i in range(0, num_episodes, _MOST_SIDE_BY_SIDE)]
+    returns, lengths = zip(*(_play_in_gymnasium(task, act, some) for some in rounds), strict=True)
+    return Scores(np.concatenate(returns), np.concatenate(lengths), seeds, task.gymnasium_id)
+
+
+def _play_in_gymnasium(
+    task: Task, act: Callable[[np.ndarray], np.ndarray], seeds: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns and lengths of the episodes that begin with these seeds, side by side."""
+    keywords = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
+    returns, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), np.int64)
+    is_over = np.zeros(len(seeds), bool)
+    shares = [share for share in np.array_split(np.arange(len(seeds)), os.cpu_count() or 1) if share.size]
     workers = [_Worker() for _ in shares]
     try:
         for worker, share in zip(workers, shares, strict=True):
@@ -108,7 +121,7 @@ def score_in_gymnasium(task: Task, act: Callable[[np.ndarray], np.ndarray], num_
     finally:
         for worker in workers:
             worker.close()
-    return Scores(returns, lengths, seeds, task.gymnasium_id)
+    return returns, lengths
 
 
 class _Worker:

@@ -27,6 +27,7 @@ class Arguments:
 def main(arguments: list[str]) -> None:
     """Write the file."""
     parsed = cli.parse(Arguments, arguments, USAGE)
+    cli.stay_on_cpu()
     if parsed.run is None:
         raise UserError(f"say which run: run=RUN_DIR, or {zoo.PREFIX}NAME")
     try:

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_walk.algos import make_algorithm
+from mjx_walk.checkpoint import list_steps
 from mjx_walk.config import Config
 from mjx_walk.envs import Task
 from mjx_walk.errors import UserError
 from mjx_walk.interrupt import Interrupt
-from mjx_walk.metrics import Progress, Row, name_metrics
+from mjx_walk.metrics import Progress, Row, name_metrics, physics_warnings
 from mjx_walk.recorder import Follower, Recorder
 from mjx_walk.run_folder import RunFolder
 from mjx_walk.team import Team, per_device
@@ -97,6 +98,7 @@ class Trainer:
         """
         self.config = config = configs[0]
         self._task = task
+        self._folders = folders
         self._team = team
         settings = per_device(config.algo, team.size) if team else config.algo
         alone = make_algorithm(task, config.num_envs, config.evaluation, settings)
@@ -119,7 +121,7 @@ class Trainer:
         self._started = time.monotonic()
         self._times: collections.deque[tuple[float, int]] = collections.deque()
         self._seconds_before = 0.0
-        self._has_warned = False
+        self._warned_of: set[str] = set()
 
     def train(self) -> str | None:
         """Train to the end, or until a signal asks to stop.
@@ -132,7 +134,7 @@ class Trainer:
         """
         state, chunk = self._start()
         progress = Progress(self.num_chunks * self.steps_per_chunk, chunk * self.steps_per_chunk)
-        saved_chunk = chunk if self.config.resume else -1
+        saved_chunk = chunk or -1
         self._times.append((time.monotonic(), chunk))
         for recorder in self.recorders:
             recorder.begin(chunk * self.steps_per_chunk, trains_on=chunk < self.num_chunks)
@@ -146,7 +148,7 @@ class Trainer:
                     diverged.add(recorder.config.seed)
             for recorder, row in zip(self.recorders, rows, strict=True):
                 recorder.write(row)
-                self._warn_of_overflow(row)
+                self._warn_of_physics(row)
                 self._on_metrics(row)
             self._film(state, rows)
             if not self._team or self._team.rank == 0:
@@ -200,8 +202,8 @@ class Trainer:
         keys = [jax.random.PRNGKey(recorder.config.seed) for recorder in self.recorders]
         init = make_init(self.algorithm)
         key = keys[0] if len(keys) == 1 else jnp.stack(keys)
-        if not self.config.resume:
-            return init(key), 0
+        if not self.config.resume or not any(list_steps(folder.checkpoints) for folder in self._folders):
+            return init(key), 0  # perhaps of a run that was stopped before it had saved anything
         like = jax.eval_shape(init, key)
         if self._has_axis:
             like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), like)
@@ -247,15 +249,11 @@ class Trainer:
                 own = jax.tree.map(lambda x, i=i: x[i], policies) if self._has_axis else policies
                 recorder.film(own, int(row["env_steps"]))
 
-    def _warn_of_overflow(self, row: Row) -> None:
-        if row["physics/overflow"] and not self._has_warned:
-            self._has_warned = True
-            print(
-                "warning: a Warp buffer overflowed, so that contacts were lost in some copies; the count is in the "
-                "metrics as physics/overflow. Enlarge CONTACTS_PER_COPY or CONSTRAINTS_PER_COPY in "
-                "envs/physics/mjx_warp.py",
-                file=sys.stderr,
-            )
+    def _warn_of_physics(self, row: Row) -> None:
+        for metric, warning in physics_warnings(row, self.steps_per_chunk).items():
+            if metric not in self._warned_of:
+                self._warned_of.add(metric)
+                print(f"warning: {warning}; the count is in the metrics as {metric}", file=sys.stderr)
 
     def _speed(self, chunk: int) -> float:
         """Steps per second of each run over the last `_SPEED_WINDOW` seconds or so, evaluation and saving included."""

@@ -17,6 +17,8 @@ Row = dict[str, float]
 """One line of `metrics.jsonl`; see `name_metrics` for the names."""
 
 _SUMS = ("nonfinite", "overflow", "resets", "resets_reused")
+_MANY = 0.01
+"""The share of steps that are not finite from which on it is no rare accident of the physics."""
 _SECONDS_BETWEEN_LINES = 10.0
 """Where there is no terminal, progress is a plain line this often."""
 
@@ -60,6 +62,27 @@ def name_metrics(metrics: Metrics, reward_terms: tuple[str, ...], steps_per_upda
     # Over the updates that have it: nothing is learned from a first batch, or before a replay is filled.
     known = {name: value[~np.isnan(value)] for name, value in values.items()}
     return row | {f"train/{name}": float(value.mean()) for name, value in known.items() if value.size}
+
+
+def physics_warnings(row: Row, num_steps: int) -> dict[str, str]:
+    """What a user must know of the physics behind a row, by the metric that shows it.
+
+    Args:
+        row: from `name_metrics`.
+        num_steps: environment steps behind it.
+    """
+    found = {}
+    if row["physics/overflow"]:
+        found["physics/overflow"] = (
+            "a Warp buffer overflowed, so that contacts were lost in some copies: enlarge CONTACTS_PER_COPY or "
+            "CONSTRAINTS_PER_COPY in envs/physics/mjx_warp.py"
+        )
+    if row["physics/nonfinite"] > _MANY * num_steps:
+        found["physics/nonfinite"] = (
+            f"{row['physics/nonfinite']:,.0f} of {num_steps:,} steps ended their episodes without a reward, since the "
+            "state, the observation or the reward was not finite: a reward or a model of your own may be why"
+        )
+    return found
 
 
 class MetricsWriter:

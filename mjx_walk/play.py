@@ -39,13 +39,14 @@ class Arguments:
     seconds: float = setting(1.0, above=0)
     viewer: bool = False
     seed: int = setting(0, at_least=0)
-    width: int = setting(640, at_least=64)
-    height: int = setting(480, at_least=64)
+    width: int = setting(640, at_least=64, at_most=4096)
+    height: int = setting(480, at_least=64, at_most=4096)
 
 
 def main(arguments: list[str]) -> None:
     """Play, and write what was asked for."""
     parsed = cli.parse(Arguments, arguments, USAGE)
+    cli.stay_on_cpu()
     if parsed.run is None:
         raise UserError(f"say which run: run=RUN_DIR, or one of run={zoo.PREFIX}{f', {zoo.PREFIX}'.join(zoo.names())}")
     folder = run_folder.open_existing(parsed.run)
@@ -54,6 +55,9 @@ def main(arguments: list[str]) -> None:
     film, html, gait, strip = (Path(p) if p else None for p in (parsed.out, parsed.html, parsed.gait, parsed.strip))
     if not (film or html or gait or strip or parsed.viewer):
         film = folder.product("episode.mp4")
+    cli.check_suffix(film, ".mp4", ".mkv", ".mov", ".avi")
+    for image in (gait, strip):
+        cli.check_suffix(image, ".png", ".jpg")
     asked = [path for path in (film, html, gait, strip) if path]
     for path in asked:
         cli.check_writable(path)

@@ -1,6 +1,7 @@
 """What a run leaves in its folder while it trains: its rows, its checkpoints, its best policy, its scores."""
 
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +105,10 @@ class Recorder:
             self._wandb.close()
         from mjx_walk.plots import plot_run  # Matplotlib, which training need not wait for when it begins
 
-        plot_run(self._folder)
+        try:
+            plot_run(self._folder)
+        except OSError as error:  # no reason not to score it
+            print(f"warning: {self._folder.path} could not be drawn: {error}", file=sys.stderr)
         self._policies = [(self._algorithm.policy_params(state), {"env_steps": env_steps})]
         best = self._best_policy(state)
         if best:

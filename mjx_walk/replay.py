@@ -30,7 +30,7 @@ class Replay(flax.struct.PyTreeNode):
     reward: jax.Array
     """`[T, B] f32`."""
     end: jax.Array
-    """`[T, B] i16`: whether and how the step ended its episode."""
+    """`[T, B] i16`, i32 where there are so many slots: whether and how the step ended its episode."""
     cuts: jax.Array
     """`[B] i32`: truncations so far."""
     rows: jax.Array
@@ -80,7 +80,7 @@ class ReplayBuffer:
             observation=jnp.zeros((rows + self.num_slots, copies, self.task.observation_size), self.observation_dtype),
             action=jnp.zeros((rows, copies, self.task.action_size), jnp.float32),
             reward=jnp.zeros((rows, copies), jnp.float32),
-            end=jnp.zeros((rows, copies), jnp.int16),
+            end=jnp.zeros((rows, copies), jnp.int16 if _FIRST_CUT + self.num_slots < 2**15 else jnp.int32),
             cuts=jnp.zeros(copies, jnp.int32),
             rows=jnp.zeros((), jnp.int32),
         )

@@ -9,7 +9,7 @@ from mjx_walk.checkpoint import list_steps
 from mjx_walk.config import Config, flatten, read_config, save_config
 from mjx_walk.errors import UserError
 
-MAY_DIFFER = ("run_dir", "resume", "total_steps", "wandb_project", "evaluation.films")
+MAY_DIFFER = ("run_dir", "resume", "total_steps", "algo.schedule_steps", "wandb_project", "evaluation.films")
 """Keys that a resumed run may be given anew."""
 
 

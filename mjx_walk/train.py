@@ -14,7 +14,7 @@ from omegaconf import DictConfig, open_dict
 
 from mjx_walk import cli, launch
 from mjx_walk.api import resolve, resolve_seeds, train
-from mjx_walk.config import CONFIG_DIR, complete_overrides, load_config, register_schemas, to_config
+from mjx_walk.config import CONFIG_DIR, Config, complete_overrides, load_config, register_schemas, to_config
 from mjx_walk.errors import UserError
 from mjx_walk.interrupt import Stopped, exit_code
 from mjx_walk.team import Team, join
@@ -37,7 +37,7 @@ usage: python -m mjx_walk.train [env=humanoid|humanoid_standup|walker2d] [algo=p
 class Own:
     """Arguments that are no settings of a run."""
 
-    seeds: Any = 1
+    seeds: Any = None
     devices: Any = None
 
 
@@ -49,11 +49,8 @@ def main(arguments: list[str]) -> int:
     if any(argument.startswith("-") for argument in arguments):
         _through_hydra(arguments)
         return 0
-    given = [argument for argument in arguments if argument.startswith(("seeds=", "devices="))]
-    settings = [argument for argument in arguments if argument not in given]
-    own = cli.parse(Own, given, USAGE)
-    has_seeds = any(argument.startswith("seeds=") for argument in given)
-    if has_seeds and own.devices is not None:
+    own, settings = cli.parse_own(Own, Config, arguments, USAGE)
+    if own.seeds is not None and own.devices is not None:
         raise UserError("give seeds=… or devices=…, not both")
     team = join() if own.devices is not None else None
     if own.devices is not None and not team:
@@ -63,7 +60,7 @@ def main(arguments: list[str]) -> int:
             return launch.run(arguments, size)
     if team:
         return _train_in_team(settings, team)
-    configs = resolve_seeds(settings, cli.read_seeds(own.seeds)) if has_seeds else [resolve(settings)]
+    configs = resolve_seeds(settings, cli.read_seeds(own.seeds)) if own.seeds is not None else [resolve(settings)]
     _, signal_name = train(configs)
     return exit_code(signal_name) if signal_name else 0
 
@@ -114,7 +111,9 @@ def _sweep_job(node: DictConfig) -> None:
     if node.run_dir is None:
         with open_dict(node):
             node.run_dir = HydraConfig.get().runtime.output_dir
-    train([to_config(node)])
+    _, signal_name = train([to_config(node)])
+    if signal_name:
+        raise Stopped(signal_name)  # also the jobs after it
 
 
 if __name__ == "__main__":

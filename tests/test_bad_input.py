@@ -1,5 +1,9 @@
 """Each mistake gets one clear line that names the valid choices, exit code 2, and costs nothing."""
 
+import dataclasses
+import errno
+import itertools
+import os
 import subprocess
 import sys
 
@@ -7,9 +11,14 @@ import pytest
 import yaml
 from commands import TINY, TINY_CHUNK, command, command_here
 
-from mjx_walk import api, run_folder
+from mjx_walk import api, cli, run_folder
+from mjx_walk import bench as bench_command
+from mjx_walk import compare as compare_command
 from mjx_walk import eval as eval_command
 from mjx_walk import train as train_command
+from mjx_walk.algos import ALGORITHMS
+from mjx_walk.config import Config, flatten, load_config
+from mjx_walk.envs import TASKS
 from mjx_walk.errors import UserError
 
 CASES = [
@@ -21,6 +30,8 @@ CASES = [
     (["env.version=v3"], "env.version=v3: choose one of: v5, v4"),
     (["recipe=nope"], "recipes: cpu/humanoid_a2c"),
     (["recipe=report/e_td3", "algo=sac"], "this recipe does not suit the env and algo that were asked for"),
+    (["device=2"], "unknown key 'device'; did you mean: devices?"),
+    (["seedz=2"], "unknown key 'seedz'; did you mean: seed, seeds?"),
     (["num_env=4"], "unknown key 'num_env'; did you mean: num_envs"),
     (["algo.discont=0.9"], "unknown key 'algo.discont'; did you mean: algo.discount"),
     (["+extra=1"], "'+extra=1': keys cannot be added or removed"),
@@ -104,6 +115,38 @@ def test_so_do_the_others(module, argument, tmp_path, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_bench_names_its_own_keys():
+    with pytest.raises(UserError, match=r"unknown key 'second'; did you mean: seconds, seed\?"):
+        bench_command.main(["second=3"])
+
+
+@pytest.mark.parametrize("command", [train_command.Own, bench_command.Arguments, compare_command.Arguments])
+def test_no_setting_is_taken_for_a_command_s_own(command):
+    own = {field.name for field in dataclasses.fields(command)}
+    for env, algo in itertools.product(TASKS, ALGORITHMS):
+        settings = [f"{key}=1" for key in flatten(load_config([f"env={env}", f"algo={algo}"])) if key not in own]
+        assert cli.parse_own(command, Config, settings, "")[1] == settings
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
+def test_a_disk_that_takes_nothing_costs_one_line(number, monkeypatch, capsys):
+    def fail(_):
+        raise OSError(number, os.strerror(number), "some/file")
+
+    with pytest.raises(SystemExit) as ended:
+        cli.main(fail)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == f"error: [Errno {number}] {os.strerror(number)}: 'some/file'\n"
+
+
+def test_what_can_be_written_is_not_left_behind(tmp_path):
+    cli.check_writable(tmp_path / "new" / "file")
+    assert list((tmp_path / "new").iterdir()) == []
+    (tmp_path / "old").write_text("x")
+    cli.check_writable(tmp_path / "old")
+    assert (tmp_path / "old").read_text() == "x"
+
+
 def test_warp_missing(monkeypatch):
     from mjx_walk.envs import physics
 
@@ -145,6 +188,9 @@ def test_resume_names_the_keys_that_differ(finished):
     with pytest.raises(UserError) as error:
         train_command.main([*same, "algo.discount=0.5", "seed=9"])
     assert "algo.discount (was 0.99, now 0.5)" in str(error.value) and "seed (was 0, now 9)" in str(error.value)
+    with pytest.raises(UserError) as error:
+        train_command.main([f"run_dir={finished}", "resume=true", "checkpoint.keep=5"])
+    assert str(error.value).endswith(": checkpoint.keep (was 3, now 5)")
     with pytest.raises(UserError, match="may only grow"):
         train_command.main([*same[:-1], f"total_steps={TINY_CHUNK}"])
     with pytest.raises(UserError, match=r"env\.name \(was walker2d, now humanoid\)"):

@@ -1,10 +1,13 @@
 """Films and gait sheets, from the real Gymnasium."""
 
+import subprocess
+import sys
+
 import imageio.v3 as iio
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from commands import command, command_here
+from commands import ENVIRONMENT, command, command_here
 
 import mjx_walk
 from mjx_walk import rendering
@@ -91,11 +94,21 @@ def test_mistakes_cost_one_line(tmp_path, monkeypatch, capsys):
         (("run=nowhere",), "no run at 'nowhere'"),
         (("run=zoo:walker2d-sac", f"out={tmp_path}/file/walk.mp4"), f"cannot write {tmp_path}/file/walk.mp4"),
         (("run=zoo:walker2d-sac", f"html={tmp_path}/file/walk.html"), f"cannot write {tmp_path}/file/walk.html"),
+        (("run=zoo:walker2d-sac", "out=walk"), "walk: give it one of these endings: .mp4, .mkv, .mov, .avi"),
+        (("run=zoo:walker2d-sac", "gait=x.foo"), "x.foo: give it one of these endings: .png, .jpg"),
+        (("run=zoo:walker2d-sac", "width=20000"), "width=20000: must be at most 4096"),
         (("run=zoo:walker2d-sac", "viewer=true"), "viewer=true needs a screen"),
     ):
         assert command_here("play", *arguments) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("error: ") and message in line
+
+
+def test_jax_has_not_chosen_a_device_before_the_command_does():
+    """Else `stay_on_cpu` would come too late where there is a GPU."""
+    code = "import mjx_walk.play, mjx_walk.export; from jax._src import xla_bridge; print(list(xla_bridge._backends))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, check=True)
+    assert done.stdout == "[]\n"
 
 
 def test_opengl_is_chosen_and_what_is_missing_is_said(monkeypatch):

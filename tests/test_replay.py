@@ -99,6 +99,18 @@ def test_memory_is_counted_and_types_are_kept():
     assert buffer.num_bytes == pytest.approx(8000 * (6 + 4 + 4 + 2), rel=0.02)
 
 
+def test_a_last_observation_is_found_in_any_of_very_many_slots():
+    buffer = ReplayBuffer(Counter(10), 1, 500_000)
+    replay = buffer.init().replace(cuts=jnp.array([40_000]))
+    one = jnp.ones((1, 1))
+    is_cut = jnp.ones((1, 1), bool)
+    obs = jnp.full((1, 1, 3), 7.0)
+    replay = buffer.insert(replay, Steps(0 * obs, one[..., None], one, ~is_cut, is_cut, obs))
+    replay = buffer.insert(replay, Steps(0 * obs, one[..., None], one, ~is_cut, ~is_cut, 0 * obs))
+    drawn = buffer.sample(replay, jax.random.PRNGKey(0), 8, 1, 0.9)
+    assert (drawn.next_observation == 7).all() and (drawn.discount == np.float32(0.9)).all()
+
+
 def test_insertion_writes_in_place():
     """The compiled insertion of a few rows allocates nothing of the buffer's size, and touches few bytes."""
     task = Counter(1000)

@@ -4,6 +4,7 @@ import functools
 import json
 import os
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -144,6 +145,32 @@ def test_signals_finish_the_chunk_save_and_say_how_to_go_on(tmp_path, name):
     newest = checkpoint.list_steps(run_dir / "checkpoints")[-1]
     assert int(newest.name) == last
     assert resolve([f"run_dir={run_dir}", "resume=true"]).env.name == "walker2d"
+
+
+def test_a_run_that_saved_nothing_begins_again(tmp_path):
+    run_dir = tmp_path / "run"
+    train_here(run_dir, f"total_steps={2 * TINY_CHUNK}")
+    whole = leaves(run_dir, 2)
+    shutil.rmtree(run_dir / "checkpoints")
+    (run_dir / "checkpoints").mkdir()
+    train_here(run_dir, "resume=true", tiny=[])
+    again = leaves(run_dir, 2)
+    for name, leaf in whole.items():
+        np.testing.assert_array_equal(leaf, again[name], err_msg=name)
+    assert len((run_dir / "metrics.jsonl").read_text().splitlines()) == 2
+
+
+def test_a_longer_schedule_may_be_given_and_its_end_is_told(tmp_path, capsys):
+    run_dir, linear = tmp_path / "2026_11_23", ("algo.learning_rate_schedule=linear", "algo.schedule_steps=128")
+    train_here(run_dir, f"total_steps={2 * TINY_CHUNK}", *linear)
+    assert capsys.readouterr().err.count("warning") == 0
+    params = "params.policy.params.hidden_0.kernel"
+    for more, is_told, learns in (((), True, False), (("algo.schedule_steps=1000",), False, True)):
+        copy = tmp_path / f"copy_{learns}"
+        shutil.copytree(run_dir, copy)
+        train_here(copy, "resume=true", f"total_steps={4 * TINY_CHUNK}", *more, tiny=[])
+        assert ("from algo.schedule_steps=128 on the learning rate is zero" in capsys.readouterr().err) == is_told
+        assert np.array_equal(leaves(copy, 2)[params], leaves(copy, 4)[params]) != learns
 
 
 def ctrl_c(*_):

@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import gymnasium
 import jax
@@ -17,6 +18,7 @@ from mjx_walk import train as train_command
 from mjx_walk.algos import make_algorithm
 from mjx_walk.api import make_task
 from mjx_walk.config import load_config
+from mjx_walk.envs import make_env
 from mjx_walk.errors import UserError
 from mjx_walk.loop import make_chunk, make_init
 
@@ -99,6 +101,16 @@ def test_a_loaded_policy_scores_alike_in_its_engine_and_in_gymnasium(finished):
     assert abs(sim.mean - real.mean) < max(4 * error, 0.02 * abs(real.mean))
 
 
+def test_many_episodes_are_played_in_rounds(finished, monkeypatch):
+    run, _ = finished
+    at_once = run.evaluate(5, seed=3)
+    monkeypatch.setattr("mjx_walk.evaluation._MOST_SIDE_BY_SIDE", 2)
+    in_rounds = run.evaluate(5, seed=3)
+    assert in_rounds.seeds == at_once.seeds == [3, 4, 5, 6, 7]
+    assert in_rounds.returns == pytest.approx(at_once.returns, rel=1e-6)
+    assert in_rounds.lengths.tolist() == at_once.lengths.tolist()
+
+
 def test_eval_command(finished, capsys):
     run, _ = finished
     assert command_here("eval", f"run={run.path}", "episodes=2", "backend=sim") == 0
@@ -146,6 +158,42 @@ def test_a_sweep_puts_each_job_in_its_own_folder(tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().err
     assert "choose num_envs a multiple of 2" in printed and "Traceback" not in printed
     assert len(list(tmp_path.glob("runs/sweeps/*/*/metrics.jsonl"))) == 3
+
+
+def test_a_signal_ends_a_sweep(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(loop.Trainer, "_stop_signal", lambda self, interrupt: "SIGTERM")
+    assert command_here("train", "-m", "seed=0,1", *TINY, f"total_steps={TINY_CHUNK}") == 143
+    assert len(list(tmp_path.glob("runs/sweeps/*/*/config.yaml"))) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == "Stopped by SIGTERM."
+
+
+def test_a_model_is_found_from_another_folder_and_a_number_is_a_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arguments = [*TINY, f"total_steps={TINY_CHUNK}", "env.xml_file=mine.xml", "run_dir=2026_11_23"]
+    theirs = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "walker2d.xml"
+    (tmp_path / "mine.xml").write_text(theirs.read_text())
+    assert command_here("train", *arguments) == 0
+    monkeypatch.chdir("/")
+    assert command_here("eval", f"run={tmp_path / '2026_11_23'}", "episodes=1") == 0
+    assert "Walker2d-v5: " in capsys.readouterr().out
+
+
+def test_an_asset_of_gymnasium_s_is_a_model():
+    task = make_env("walker2d", physics="c", xml_file="walker2d.xml")
+    env = gymnasium.make(task.gymnasium_id, **task.gymnasium_kwargs())
+    assert env.unwrapped.fullpath.endswith("assets/walker2d.xml")
+    np.testing.assert_array_equal(env.unwrapped.model.geom_size, task.model.geom_size)
+
+
+def test_a_reward_that_is_not_finite_is_told_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(
+        "import jax.numpy as jnp\ndef root(step):\n    return {'reward_root': jnp.sqrt(-1 - step.after.qpos[0] ** 2)}\n"
+    )
+    train_command.main([*TINY, f"total_steps={2 * TINY_CHUNK}", "env.reward_function=mine.py:root"])
+    said = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    assert len(said) == 1 and "64 of 64 steps ended their episodes without a reward" in said[0]
 
 
 def test_training_that_diverges_stops_and_keeps_what_was_saved_before(tmp_path):

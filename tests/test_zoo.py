@@ -49,5 +49,9 @@ def test_scoring_one_does_not_write_into_the_package(capsys):
 def test_the_table_and_an_unknown_name(capsys):
     done = command("zoo")
     assert done.returncode == 0 and done.stdout.count("python -m mjx_walk.train") == len(NAMES), done.stderr
+    for name in ("", "../elsewhere", "/elsewhere"):
+        assert command_here("zoo", "add=zoo:walker2d-sac", f"name={name}") == 2
+        assert "letters, digits, '_' and '-' make a name" in capsys.readouterr().err
+    assert zoo.names() == NAMES
     assert command_here("eval", "run=zoo:humanoid-dqn") == 2
     assert "no policy 'humanoid-dqn' in the zoo; choose one of: " in capsys.readouterr().err

@@ -1,5 +1,7 @@
 """The `warp` engine: MJX on MuJoCo Warp, for NVIDIA GPUs (and, slowly, for CPU tests)."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -40,7 +42,10 @@ class WarpEngine:
         self._model = mjx.put_model(self._mj_model, impl="warp", device=jax.local_devices()[0]).tree_replace(
             {"opt._impl.warn_overflow": 0}
         )
-        self._last_model = self._model.tree_replace({"opt._impl.run_rne_postconstraint": "cfrc_ext" in derived})
+        last_model = self._model.tree_replace({"opt._impl.run_rne_postconstraint": "cfrc_ext" in derived})
+        self._mjx_forward = _over_batch(mjx.forward, self._model)
+        self._mjx_step = _over_batch(mjx.step, self._model)
+        self._last_mjx_step = _over_batch(mjx.step, last_model)
         self._num_substeps = num_substeps
         self._derived = derived
         self.forward = batch_once(self._forward)
@@ -62,14 +67,14 @@ class WarpEngine:
         return jax.vmap(lambda s: blank.replace(qpos=s.qpos, qvel=s.qvel, qacc_warmstart=s.qacc_warmstart))(state)
 
     def _forward(self, state: PhysicsState) -> Derived:
-        return read_derived(_vmapped(mjx.forward, self._model, self._data(state)), self._derived)
+        return read_derived(self._mjx_forward(self._data(state)), self._derived)
 
     def _step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Derived, jax.Array]:
         data = self._data(state).replace(ctrl=ctrl)
         overflow = lost_rows = jnp.zeros(ctrl.shape[0], bool)
         for substep in range(self._num_substeps):
             is_last = substep == self._num_substeps - 1
-            data = _vmapped(mjx.step, self._last_model if is_last else self._model, data)
+            data = self._last_mjx_step(data) if is_last else self._mjx_step(data)
             # The buffer is shared: once it is full, any copy may have lost a contact.
             # Pairs that do not fit are dropped before they become contacts, and `nacon` never shows it.
             most = jnp.maximum(data._impl.nacon, data._impl.ncollision)
@@ -81,5 +86,9 @@ class WarpEngine:
         return state, read_derived(data, self._derived), overflow | lost_rows
 
 
-def _vmapped(function, model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    return jax.vmap(lambda d: function(model, d))(data)
+_OnData = Callable[[mjx.Data], mjx.Data]
+
+
+def _over_batch(function: Callable[[mjx.Model, mjx.Data], mjx.Data], model: mjx.Model) -> _OnData:
+    """For a whole batch, and traced once: anew for each substep it would take a third of a chunk's tracing."""
+    return jax.jit(jax.vmap(lambda data: function(model, data)), inline=True)

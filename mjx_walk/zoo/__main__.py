@@ -1,6 +1,7 @@
 """`python -m mjx_walk.zoo`: list the policies that come with the package; for its authors: put a run's among them."""
 
 import dataclasses
+import re
 from typing import Any
 
 import jax
@@ -34,6 +35,8 @@ def main(arguments: list[str]) -> None:
         return
     if parsed.name is None:
         raise UserError("say under which name: name=humanoid-ppo")
+    if not re.fullmatch(r"[\w-]+", parsed.name):
+        raise UserError(f"name={parsed.name}: letters, digits, '_' and '-' make a name")
     source = run_folder.open_existing(parsed.add)
     run = load_run(source.path, "auto")
     run.policy_params = _rounded_to(run.config.algo.network_dtype, run.policy_params)
