@@ -52,7 +52,8 @@ class Config:
     total_steps: int = setting(100_000_000, at_least=1)
     """Environment steps over all copies, rounded up to whole chunks."""
     updates_per_chunk: int = setting(1, at_least=1)
-    """Updates compiled into one program call; logging, evaluation and saving happen between chunks."""
+    """Updates compiled into one program call; logging, evaluation and saving happen between chunks. With a single one
+    Warp records its kernels anew in most chunks, since XLA keeps what physics reads where it then puts the metrics."""
     run_dir: str | None = None
     """By default `runs/ENV_ALGO/TIME`."""
     resume: bool = False

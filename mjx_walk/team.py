@@ -73,13 +73,19 @@ class Team:
             out_specs=PartitionSpec(AXIS),
             check_vma=False,  # Brax's networks and losses know nothing of it
         )
-        act, learn_together = jax.jit(collect, donate_argnums=0), jax.jit(mapped, donate_argnums=0)
+        act, learn_together = in_place(collect), jax.jit(mapped, donate_argnums=0)
         compiled: list[Callable] = []
+        batches: list[Any] = []
 
         def chunk(state):
+            if not batches:
+                shapes = jax.eval_shape(collect, state)[1]
+                batches.append(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
             rows = []
             for _ in range(num_updates):
-                shared = jax.tree.map(self._share, act(state))
+                state, batch = act(state, batches.pop())
+                batches.append(batch)
+                shared = jax.tree.map(self._share, (state, batch))
                 if not compiled:
                     compiled.append(learn_together.lower(*shared).compile())
                     self.wait()
@@ -110,6 +116,15 @@ class Team:
         encoded = text.encode()[:_PATH_BYTES]
         data[: len(encoded)] = np.frombuffer(encoded, np.uint8)
         return bytes(np.asarray(multihost_utils.broadcast_one_to_all(data))).rstrip(b"\0").decode()
+
+
+def in_place(collect: Callable[[Any], tuple[Any, Any]]) -> Callable[[Any, Any], tuple[Any, Any]]:
+    """Compile `state → (state, batch)` as `(state, batch before) → (state, batch)`, both in the memory of the old ones.
+
+    Where results are in new memory, XLA keeps arrays there that physics reads, and Warp records its kernels anew for
+    every array that has moved.
+    """
+    return jax.jit(lambda state, batch_before: collect(state), donate_argnums=(0, 1), keep_unused=True)
 
 
 def per_device(config: Any, size: int) -> Any:

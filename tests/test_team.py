@@ -18,8 +18,9 @@ from mjx_walk.algos.ppo import PPOConfig, make_ppo
 from mjx_walk.collectives import AXIS
 from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.loop import make_init
 from mjx_walk.metrics import read_rows
-from mjx_walk.team import OWN
+from mjx_walk.team import OWN, in_place
 from mjx_walk.team_checkpoint import restore_newest
 
 KEY = jax.random.PRNGKey(0)
@@ -75,6 +76,22 @@ def test_running_statistics_are_of_all_devices():
     parts = jax.vmap(update, axis_name=AXIS)(twice(returns.init_return_scale(4)), by_copy(reward), by_copy(ended))
     for name in ("count", "mean", "variance"):
         np.testing.assert_allclose(getattr(parts, name)[0], getattr(whole, name), rtol=1e-4)
+
+
+def test_what_a_device_gathers_stays_in_the_memory_of_what_it_had_gathered_before():
+    config = PPOConfig(unroll_length=4, num_unrolls=1, num_minibatches=1)
+    algorithm = make_ppo(ObservedReward(), 16, EvaluationConfig(1), config)
+    act = in_place(algorithm.collect)
+    state = make_init(algorithm)(KEY)
+    fresh = jax.jit(algorithm.collect)(state)
+    state, batch = act(state, jax.tree.map(jnp.zeros_like, fresh[1]))
+    assert_close((state, batch), fresh)
+    places = []
+    for _ in range(3):
+        jax.block_until_ready((state, batch))
+        places.append([x.unsafe_buffer_pointer() for x in jax.tree.leaves((state, batch))])
+        state, batch = act(state, batch)
+    assert places[0] == places[1] == places[2]
 
 
 def test_a_checkpoint_of_another_run_is_refused_not_passed_over(tmp_path):
