@@ -53,7 +53,7 @@ class Config:
     """Environment steps over all copies, rounded up to whole chunks."""
     updates_per_chunk: int = setting(1, at_least=1)
     """Updates compiled into one program call; logging, evaluation and saving happen between chunks. With a single one
-    Warp records its kernels anew in most chunks, since XLA keeps what physics reads where it then puts the metrics."""
+    Warp records its kernels anew in most chunks, since some of what physics reads has moved."""
     run_dir: str | None = None
     """By default `runs/ENV_ALGO/TIME`."""
     resume: bool = False

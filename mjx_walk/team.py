@@ -59,6 +59,7 @@ class Team:
     ) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
         """As `loop.make_chunk`; the metrics are those of all devices."""
 
+        @functools.partial(jax.jit, inline=True)  # traced once, for the sizes and for the program
         def collect(state):
             return _expand(algorithm.collect(_squeeze(state)))
 
@@ -79,8 +80,7 @@ class Team:
 
         def chunk(state):
             if not batches:
-                shapes = jax.eval_shape(collect, state)[1]
-                batches.append(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+                batches.append(jax.tree.map(jnp.zeros_like, jax.eval_shape(collect, state)[1]))
             rows = []
             for _ in range(num_updates):
                 state, batch = act(state, batches.pop())
@@ -121,8 +121,8 @@ class Team:
 def in_place(collect: Callable[[Any], tuple[Any, Any]]) -> Callable[[Any, Any], tuple[Any, Any]]:
     """Compile `state → (state, batch)` as `(state, batch before) → (state, batch)`, both in the memory of the old ones.
 
-    Where results are in new memory, XLA keeps arrays there that physics reads, and Warp records its kernels anew for
-    every array that has moved.
+    Where results are in new memory, XLA may keep arrays there that physics reads, and Warp records its kernels anew
+    for every array that has moved.
     """
     return jax.jit(lambda state, batch_before: collect(state), donate_argnums=(0, 1), keep_unused=True)
 
