@@ -1,6 +1,7 @@
 """What on-policy algorithms share: networks, and collecting trajectories whose time limits are bootstrapped through."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -32,6 +33,10 @@ class OnPolicyConfig:
     """Steps of one trajectory piece, over which advantages are estimated."""
     num_unrolls: int = setting(4, at_least=1)
     """Pieces of every copy in one batch."""
+    measured_steps: int = setting(20, at_least=0)
+    """Of each copy, at the start: batches of these only tell the scale of observations and rewards. By default about as
+    long as a random policy's first episode on Humanoid; after 10 steps none has met the floor yet, and learning would
+    start with a KL of 4 to 13."""
     learning_rate: float = setting(3e-4, above=0)
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
     """`linear`: to zero over `schedule_steps`; `adaptive_kl`: the policy's is adapted after each batch so that it has
@@ -113,6 +118,8 @@ class OnPolicyGround(NamedTuple):
     policy_params: Callable[[OnPolicyState], Any]
     policy: Callable[..., PolicyFn]
     steps_per_update: int
+    num_measured_batches: int
+    """The first ones, which give the scale of observations and rewards and are not learned from."""
     remaining: Callable[[OnPolicyState], jax.Array]
     """The share of the schedules that is left."""
 
@@ -238,7 +245,17 @@ def make_on_policy(
     def remaining(state: OnPolicyState) -> jax.Array:
         return anneal(state.updates * float(steps_per_update), config.schedule_steps)
 
-    return OnPolicyGround(nets, optimizer, init, collect, policy_params, policy, steps_per_update, remaining)
+    return OnPolicyGround(
+        nets,
+        optimizer,
+        init,
+        collect,
+        policy_params,
+        policy,
+        steps_per_update,
+        math.ceil(config.measured_steps / (config.unroll_length * config.num_unrolls)),
+        remaining,
+    )
 
 
 def _pieces_first(x: jax.Array) -> jax.Array:

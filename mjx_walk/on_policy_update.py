@@ -19,25 +19,25 @@ Learn = Callable[[OnPolicyState, OnPolicyBatch], tuple[OnPolicyState, Metrics]]
 
 
 def make_algorithm(ground: OnPolicyGround, learn: Learn) -> Algorithm:
-    """An algorithm that takes only the scale of observations and rewards from its first batch, and then learns.
+    """An algorithm that takes only the scale of observations and rewards from its first batches, and then learns.
 
     The first batch is acted on without that scale. A policy that learns from it is another one under the scale: on
     Walker2d its KL from itself is 6 to 13.
     """
 
-    def learn_unless_first(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
+    def learn_once_measured(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         learned, metrics = learn(state, batch)
-        is_first = state.updates == 0
+        is_measuring = state.updates < ground.num_measured_batches
         old = (state.params, state.optimizer, state.learning_rate)
         new = (learned.params, learned.optimizer, learned.learning_rate)
-        kept = jax.tree.map(lambda old, new: jnp.where(is_first, old, new), old, new)
+        kept = jax.tree.map(lambda old, new: jnp.where(is_measuring, old, new), old, new)
         metrics = metrics | {
-            name: jnp.where(is_first, jnp.nan, value) for name, value in metrics.items() if name not in batch.stats
+            name: jnp.where(is_measuring, jnp.nan, value) for name, value in metrics.items() if name not in batch.stats
         }
         return learned.replace(params=kept[0], optimizer=kept[1], learning_rate=kept[2]), metrics
 
     return Algorithm(
-        ground.init, ground.collect, learn_unless_first, ground.policy_params, ground.policy, ground.steps_per_update
+        ground.init, ground.collect, learn_once_measured, ground.policy_params, ground.policy, ground.steps_per_update
     )
 
 

@@ -14,6 +14,7 @@ TINY = (
     "evaluation.num_envs=2",
     "evaluation.gymnasium_episodes=0",
     "algo.unroll_length=8",
+    "algo.measured_steps=8",
     "algo.num_minibatches=2",
     "algo.num_epochs=2",
     "checkpoint.every_chunks=2",

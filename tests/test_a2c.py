@@ -19,7 +19,7 @@ GAUSSIAN = {"distribution": "normal", "policy_hidden_layer_sizes": (8,), "value_
 
 def collected(task, **changes):
     """Config, algorithm, state and batch after one `collect`."""
-    config = A2CConfig(unroll_length=STEPS, reward_scale=2.0, **GAUSSIAN, **changes)
+    config = A2CConfig(unroll_length=STEPS, measured_steps=0, reward_scale=2.0, **GAUSSIAN, **changes)
     algorithm = make_a2c(task, NUM_ENVS, EvaluationConfig(1), config)
     before = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
     return config, algorithm, *jax.jit(algorithm.collect)(before)
@@ -31,7 +31,7 @@ def test_losses(gae_lambda):
     config, algorithm, state, batch = collected(
         DelayedReward(), gae_lambda=gae_lambda, discount=0.5, normalize_advantages=False
     )
-    after, metrics = jax.jit(algorithm.learn)(state.replace(updates=jnp.int32(1)), batch)
+    after, metrics = jax.jit(algorithm.learn)(state, batch)
     steps, nets = batch.transitions, networks.make_ppo_networks(DelayedReward(), config)
     obs = jnp.concatenate([steps.observation, steps.next_observation], axis=1)
     values = np.asarray(nets.value_network.apply(state.normalizer, state.params.value, obs))
@@ -94,10 +94,10 @@ def test_adaptive_rate_needs_several_minibatches():
 def test_adaptive_rate_follows_how_far_the_policy_moves():
     settings = {"learning_rate_schedule": "adaptive_kl", "num_minibatches": 8, "learning_rate": 1e-2}
     _, algorithm, state, batch = collected(RewardedAction(), target_kl=1e-5, **settings)
-    after, metrics = jax.jit(algorithm.learn)(state.replace(updates=jnp.int32(1)), batch)
+    after, metrics = jax.jit(algorithm.learn)(state, batch)
     assert float(after.learning_rate) == pytest.approx(1e-2 / 1.5, rel=1e-5) and metrics["kl"] > 2e-5
     _, algorithm, state, batch = collected(RewardedAction(), target_kl=10.0, **settings | {"learning_rate": 1e-4})
-    after, _ = jax.jit(algorithm.learn)(state.replace(updates=jnp.int32(1)), batch)
+    after, _ = jax.jit(algorithm.learn)(state, batch)
     assert float(after.learning_rate) == pytest.approx(1e-4 * 1.5, rel=1e-5)
 
 

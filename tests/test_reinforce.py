@@ -14,6 +14,7 @@ NUM_ENVS, STEPS, LEARNED = 16, 6, 4
 # What follows the piece counts 0.5³ at the fourth step and 0.5² at the fifth.
 SETTINGS = {
     "unroll_length": STEPS,
+    "measured_steps": 0,
     "discount": 0.5,
     "max_unseen": 0.2,
     "baseline": "mean",
@@ -26,7 +27,7 @@ def learned(task, **changes):
     config = REINFORCEConfig(**SETTINGS, **changes)
     algorithm = make_reinforce(task, NUM_ENVS, EvaluationConfig(1), config)
     state, batch = jax.jit(algorithm.collect)(jax.jit(algorithm.init)(jax.random.PRNGKey(0)))
-    return config, state, batch, jax.jit(algorithm.learn)(state.replace(updates=jnp.int32(1)), batch)[1]
+    return config, state, batch, jax.jit(algorithm.learn)(state, batch)[1]
 
 
 def test_loss_over_the_steps_whose_future_was_seen():

@@ -49,7 +49,9 @@ def assert_close(tree, other):
 
 def test_two_devices_learn_what_one_learns_from_both_batches():
     settings = {"num_unrolls": 1, "num_minibatches": 1, "num_epochs": 3, "entropy_cost": 0.0}
-    config = PPOConfig(unroll_length=4, normalize_advantages=False, normalize_rewards=True, **settings)
+    config = PPOConfig(
+        unroll_length=4, measured_steps=0, normalize_advantages=False, normalize_rewards=True, **settings
+    )
     algorithm = make_ppo(ObservedReward(), 16, EvaluationConfig(1), config)
     state, batch = jax.jit(algorithm.collect)(algorithm.init(KEY))
     alone, _ = jax.jit(algorithm.learn)(state, batch)
@@ -62,6 +64,8 @@ def test_two_devices_learn_what_one_learns_from_both_batches():
         both = getattr(together, name)
         assert_close(jax.tree.map(lambda x: x[0], both), jax.tree.map(lambda x: x[1], both))
         assert_close(jax.tree.map(lambda x: x[0], both), getattr(alone, name))
+    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), alone.params, state.params)
+    assert max(jax.tree.leaves(moved)) > 1e-4
 
 
 def test_running_statistics_are_of_all_devices():
