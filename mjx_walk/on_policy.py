@@ -35,7 +35,7 @@ class OnPolicyConfig:
     """Pieces of every copy in one batch."""
     measured_steps: int = setting(16, at_least=0)
     """Of each copy, at the start: batches of these only tell the scale of observations and rewards. Ten are too few on
-    Humanoid, whose random policy falls in 24 on average: scaled by the first ten, the positions of the next ten are two
+    Humanoid, which falls in 24 under random actions: scaled by the first ten, the positions of the next ten are two
     standard deviations away, and learning starts with a KL of 3 to 13."""
     learning_rate: float = setting(3e-4, above=0)
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
