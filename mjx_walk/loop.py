@@ -138,34 +138,19 @@ class Trainer:
         self._times.append((time.monotonic(), chunk))
         for recorder in self.recorders:
             recorder.begin(chunk * self.steps_per_chunk, trains_on=chunk < self.num_chunks)
-        pending: tuple[int, Metrics, jax.Array] | None = None
         diverged: set[int] = set()
-
-        def log(chunk: int, metrics: Metrics, are_sound: jax.Array) -> None:
-            rows = self._rows(chunk, metrics)
-            for recorder, is_sound in zip(self.recorders, np.atleast_1d(are_sound), strict=True):
-                if not is_sound:
-                    diverged.add(recorder.config.seed)
-            for recorder, row in zip(self.recorders, rows, strict=True):
-                recorder.write(row)
-                self._warn_of_physics(row)
-                self._on_metrics(row)
-            self._film(state, rows)
-            if not self._team or self._team.rank == 0:
-                progress.update(_mean_row(rows))
-
         with Interrupt() as interrupt:
             while chunk < self.num_chunks and not self._stop_signal(interrupt) and not diverged:
                 state, metrics = self._chunk(state)
-                if pending:  # fetched while the next chunk runs
-                    log(*pending)
                 chunk += 1
-                pending = (chunk, metrics, self._are_sound(state))
+                rows = self._rows(chunk, metrics)  # waits for the chunk, so that its row tells the time of its end
+                self._log(state, rows, progress)
+                diverged = {
+                    r.config.seed for r, ok in zip(self.recorders, self._soundness(state), strict=True) if not ok
+                }
                 if chunk % self.config.checkpoint.every_chunks == 0:
                     self._save(state, chunk)
                     saved_chunk = chunk
-            if pending:
-                log(*pending)
             signal_name = self._stop_signal(interrupt)
             if saved_chunk != chunk:
                 self._save(state, chunk)
@@ -241,8 +226,18 @@ class Trainer:
             rows.append(common | name_metrics(own, self._task.reward_terms, self._steps_per_update) | speed)
         return rows
 
+    def _log(self, state: TrainState, rows: list[Row], progress: Progress) -> None:
+        """Write and show the rows of the chunk that ended with a TrainState."""
+        for recorder, row in zip(self.recorders, rows, strict=True):
+            recorder.write(row)
+            self._warn_of_physics(row)
+            self._on_metrics(row)
+        self._film(state, rows)
+        if not self._team or self._team.rank == 0:
+            progress.update(_mean_row(rows))
+
     def _film(self, state: TrainState, rows: list[Row]) -> None:
-        """Film the policies of those runs whose round of evaluation has ended; a row may be one chunk behind them."""
+        """Film the policies of those runs whose round of evaluation has ended."""
         policies = self.algorithm.policy_params(state)
         for i, (recorder, row) in enumerate(zip(self.recorders, rows, strict=True)):
             if "eval/return" in row:
@@ -269,8 +264,7 @@ class Trainer:
 
     def _save(self, state: TrainState, chunk: int) -> None:
         """Save the TrainState of every run whose policy is finite."""
-        are_sound = np.atleast_1d(self._are_sound(state))
-        for recorder, own, is_sound in zip(self.recorders, self._split(state), are_sound, strict=True):
+        for recorder, own, is_sound in zip(self.recorders, self._split(state), self._soundness(state), strict=True):
             if is_sound:
                 recorder.save(own, chunk * self.steps_per_chunk, self._seconds())
 
@@ -281,6 +275,10 @@ class Trainer:
         number = signal.Signals[interrupt.signal_name].value if interrupt.signal_name else 0
         number = max(self._team.gather(number))
         return signal.Signals(number).name if number else None
+
+    def _soundness(self, state: TrainState) -> np.ndarray:
+        """Whether each run's policy is finite, as an array of bool."""
+        return np.atleast_1d(self._are_sound(state))
 
     def _has_finite_policy(self, state: TrainState) -> jax.Array:
         leaves = jax.tree.leaves(self.algorithm.policy_params(state))

@@ -186,6 +186,25 @@ def test_an_asset_of_gymnasium_s_is_a_model():
     np.testing.assert_array_equal(env.unwrapped.model.geom_size, task.model.geom_size)
 
 
+def test_a_chunk_is_told_before_the_next_begins(tmp_path, monkeypatch):
+    """So that a row's seconds, and the speed beside them, are those of its own chunk."""
+    events = []
+
+    def counted(*args, **kwargs):
+        chunk = make_chunk(*args, **kwargs)
+
+        def begin(state):
+            events.append("begins")
+            return chunk(state)
+
+        return begin
+
+    monkeypatch.setattr(loop, "make_chunk", counted)
+    overrides = [*TINY, f"run_dir={tmp_path / 'run'}", f"total_steps={3 * TINY_CHUNK}"]
+    mjx_walk.run(overrides, on_metrics=lambda row: events.append("is told"))
+    assert events == 3 * ["begins", "is told"]
+
+
 def test_a_reward_that_is_not_finite_is_told_once(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(
