@@ -195,15 +195,43 @@ def _one_line(error: BaseException, overrides: list[str]) -> str:
             choices = near or [key for key in valid if key.rpartition(".")[0] == section] or valid
             return f"unknown key '{unknown[0]}'; did you mean: {', '.join(choices)}?"
     if "Could not find 'recipe/" in texts[0]:
-        names = sorted(str(p.relative_to(Path(CONFIG_DIR) / "recipe"))[:-5] for p in _recipes())
-        return f"{_first_line(error)}; recipes: {', '.join(names)}"
+        return f"{_first_line(error)}; recipes: {', '.join(recipe_names())}"
     key = getattr(error, "full_key", None) or getattr(error.__cause__, "full_key", None)
     detail = _first_line(error.__cause__ or error)
     return f"{key}: {detail}" if key else detail
 
 
-def _recipes() -> list[Path]:
-    return list((Path(CONFIG_DIR) / "recipe").glob("**/[!_]*.yaml"))
+def recipe_names() -> list[str]:
+    """What `recipe=` can be: `cpu/humanoid_ppo`."""
+    folder = Path(CONFIG_DIR) / "recipe"
+    return sorted(str(path.relative_to(folder).with_suffix("")) for path in folder.glob("**/[!_]*.yaml"))
+
+
+def training_command(config: Config) -> str:
+    """What trains with these settings, in few words: a recipe for task and algorithm, and what differs from it."""
+    given = [f"env={config.env.name}", f"algo={config.algo.name}"]
+    usual = f"{config.hardware}/{config.env.name}_{config.algo.name}"
+    recipes = [f"recipe={name}" for name in recipe_names() if Path(name).name == Path(usual).name and name != usual]
+    own = flatten(config)
+    commands = []
+    for asked in (given, *([*given, recipe] for recipe in recipes)):
+        settings = flatten(load_config([f"hardware={config.hardware}", *asked]))
+        learned_from = (key for key in sorted(own) if not key.startswith(_NOT_LEARNED_FROM))
+        commands.append([*asked, *(f"{key}={own[key]}" for key in learned_from if own[key] != settings.get(key))])
+    return " ".join(["python -m mjx_walk.train", *min(commands, key=len)])
+
+
+_NOT_LEARNED_FROM = (
+    "hardware",
+    "physics",
+    "updates_per_chunk",
+    "run_dir",
+    "resume",
+    "wandb",
+    "evaluation.",
+    "checkpoint.",
+)
+"""How the keys begin that a command may leave out and still train the same."""
 
 
 def compile_cache_dir() -> str:

@@ -8,7 +8,7 @@ from commands import command, command_here
 
 import mjx_walk
 from mjx_walk import zoo
-from mjx_walk.config import flatten, load_config, read_config
+from mjx_walk.config import flatten, load_config, read_config, training_command
 from mjx_walk.run_folder import open_existing
 
 NAMES = zoo.names()
@@ -32,9 +32,12 @@ def test_a_policy_is_small_and_scores_about_what_it_did(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_its_command_gives_its_settings(name):
     folder = open_existing(f"zoo:{name}")
-    words = json.loads(folder.gymnasium_scores.read_text())["command"].split()
+    config = read_config(folder.config)
+    command = json.loads(folder.gymnasium_scores.read_text())["command"]
+    assert command == training_command(config)
+    words = command.split()
     assert words[:3] == ["python", "-m", "mjx_walk.train"]
-    asked, own = flatten(load_config(["hardware=gpu", *words[3:]])), flatten(read_config(folder.config))
+    asked, own = flatten(load_config(["hardware=gpu", *words[3:]])), flatten(config)
     learned_from = [key for key in own if key.startswith(("env.", "algo.")) or key in ("num_envs", "total_steps")]
     assert {key: asked[key] for key in learned_from} == {key: own[key] for key in learned_from}
 

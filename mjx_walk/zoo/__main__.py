@@ -8,7 +8,7 @@ import jax
 
 from mjx_walk import checkpoint, cli, run_folder, zoo
 from mjx_walk.api import load_run
-from mjx_walk.config import flatten, load_config, save_config
+from mjx_walk.config import save_config, training_command
 from mjx_walk.errors import UserError
 from mjx_walk.run_folder import RunFolder
 
@@ -16,9 +16,6 @@ USAGE = """
 usage: python -m mjx_walk.zoo                          list the policies
        python -m mjx_walk.zoo add=RUN_DIR name=NAME    score a run's policy and put it there
 """
-
-_NOT_LEARNED_FROM = ("run_dir", "resume", "physics", "hardware", "evaluation.", "checkpoint.", "compile_cache")
-"""Keys that a command may leave out and still train the same."""
 
 
 @dataclasses.dataclass
@@ -46,7 +43,7 @@ def main(arguments: list[str]) -> None:
     save_config(config, folder.config)
     facts = {"env_steps": run.policy_facts["env_steps"]}
     checkpoint.save(folder.best_policy, run.policy_params, facts, as_numpy=True)
-    scores.save(folder.gymnasium_scores, command=_command(config), **facts)
+    scores.save(folder.gymnasium_scores, command=training_command(config), **facts)
     print(scores)
 
 
@@ -54,18 +51,6 @@ def _rounded_to(dtype: str, policy_params: Any) -> Any:
     """A policy with weights of the precision that its networks learned with: half the bytes of bfloat16 are zeros."""
     normalizer, params = policy_params
     return normalizer, jax.tree.map(lambda x: x.astype(dtype).astype(x.dtype), params)
-
-
-def _command(config) -> str:
-    """What trains with these settings: the recipe, and what differs from it."""
-    given = [f"env={config.env.name}", f"algo={config.algo.name}"]
-    recipe, own = flatten(load_config([f"hardware={config.hardware}", *given])), flatten(config)
-    changes = [
-        f"{key}={own[key]}"
-        for key in sorted(own)
-        if not key.startswith(_NOT_LEARNED_FROM) and own[key] != recipe.get(key)
-    ]
-    return " ".join(["python -m mjx_walk.train", *given, *changes])
 
 
 if __name__ == "__main__":
