@@ -58,6 +58,7 @@ CASES = [
     (["algo=td3", "algo.policy_delay=3"], "does not divide into algo.policy_delay=3"),
     (["algo=sac", "algo.tau=0"], "algo.tau=0.0: must be above 0"),
     (["algo=sac", "algo.final_discount=1"], "algo.final_discount=1.0: must be below 1"),
+    (["algo=csac", "algo.target_entropy=3"], "algo.target_entropy=3.0: must be below 0.69"),
     (["num_envs=7"], "choose num_envs a multiple of 16"),
     (["env.name=walker2d"], "env.name=walker2d: choose one of: humanoid"),
     (["env=walker2d", "env.version=v4", "env.frame_skip=2"], "walker2d v4 does not take frame_skip"),

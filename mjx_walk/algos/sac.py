@@ -31,9 +31,10 @@ class SACConfig(OffPolicyConfig):
     init_alpha: float = setting(1.0, above=0)
     """The temperature to begin with."""
     alpha_learning_rate: float = setting(3e-4, above=0)
-    target_entropy: float = -0.5
-    """That the temperature keeps the policy at, in nats per action dimension; Brax's is -0.5."""
-    final_target_entropy: float | None = None
+    target_entropy: float = setting(-0.5, below=0.69)
+    """That the temperature keeps the policy at, in nats per action dimension; Brax's is -0.5. Actions lie in `[-1, 1]`,
+    so that none have more than ln 2, and a temperature that waits for more grows without end."""
+    final_target_entropy: float | None = setting(None, below=0.69)
     """What it becomes, linearly over `schedule_steps`."""
 
 
