@@ -49,6 +49,14 @@ def test_losses(gae_lambda):
     assert not np.array_equal(jax.tree.leaves(after.params)[0], jax.tree.leaves(state.params)[0])
 
 
+def test_the_loss_is_the_sum_of_its_parts_and_rewards_entropy():
+    config, algorithm, state, batch = collected(RewardedAction(), entropy_cost=0.3)
+    _, metrics = jax.jit(algorithm.learn)(state, batch)
+    losses = metrics["policy_loss"] + config.value_cost * metrics["value_loss"] + metrics["mean_out_of_bounds"]
+    assert abs(float(metrics["entropy"])) > 0.1
+    assert float(metrics["loss"]) == pytest.approx(float(losses - 0.3 * metrics["entropy"]), rel=1e-4)
+
+
 def test_correlated_noise_reaches_the_environment():
     """The policy is held at 0, nearly without noise of its own, so that the last reward tells the noise."""
     _, _, state, batch = collected(RewardedAction(), init_noise_std=1e-6, ou_noise_std=0.2)

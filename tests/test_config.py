@@ -13,6 +13,8 @@ RECIPES = sorted(
     str(path.relative_to(f"{CONFIG_DIR}/recipe"))[:-5] for path in Path(CONFIG_DIR).glob("recipe/?pu/[!_]*.yaml")
 )
 
+SCHEDULES = ("learning_rate_schedule", "entropy_schedule", "final_discount", "final_target_entropy")
+
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_every_recipe_fits(recipe):
@@ -20,7 +22,7 @@ def test_every_recipe_fits(recipe):
     env, _, algo = name.rpartition("_")
     config = load_config([f"env={env}", f"algo={algo}", f"hardware={hardware}", "physics=c"])
     assert (config.env.name, config.algo.name, config.hardware) == (env, algo, hardware)
-    if config.algo.learning_rate_schedule != "constant":
+    if any(getattr(config.algo, name, None) not in (None, "constant") for name in SCHEDULES):
         assert config.algo.schedule_steps == config.total_steps  # annealed to the end, unless it is stopped early
     algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
     assert algorithm.steps_per_update * config.updates_per_chunk < config.total_steps / 20

@@ -53,3 +53,20 @@ def test_critics_are_brax_networks_of_their_own():
     assert kernel.shape == (2, 24, 256) and (kernel[:, 23] == 0).all() and (grad[:, 23] == 0).all()
     values = np.asarray(value(params, obs, action))
     assert values.shape == (64, 2) and not np.allclose(values[:, 0], values[:, 1])
+
+
+def test_running_statistics_are_of_all_that_was_seen():
+    obs = jax.random.normal(KEY, (3, 50, 2)) * 2.0 + jnp.arange(3.0)[:, None, None]
+    normalizer = networks.init_normalizer(2)
+    for part in obs:
+        normalizer = networks.update_normalizer(normalizer, part)
+    np.testing.assert_allclose(normalizer.mean, obs.mean((0, 1)), rtol=1e-4)
+    np.testing.assert_allclose(normalizer.std, obs.std((0, 1)), rtol=1e-3)
+
+
+def test_observations_are_clipped_on_policy():
+    far, bound = jnp.full((1, 17), 100.0), jnp.full((1, 17), 2.0)
+    for clip, is_same in ((2.0, True), (None, False)):
+        act, value, policy_params, critic_params = actor_and_critic(PPOConfig(observation_clip=clip))
+        assert bool((act(policy_params, far) == act(policy_params, bound)).all()) is is_same
+        assert bool((value(critic_params, far, None) == value(critic_params, bound, None)).all()) is is_same

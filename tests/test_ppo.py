@@ -10,10 +10,14 @@ from brax.envs.base import Env, State
 from brax.training import acting
 from brax.training.agents.ppo import networks as brax_networks
 from brax.training.agents.ppo import train as brax_ppo
+from brax.training.agents.ppo.losses import PPONetworkParams
+from toy_tasks import ConstantReward, EndlessReward
 
+from mjx_walk import networks, returns
 from mjx_walk.algos.ppo import PPOConfig, make_ppo
 from mjx_walk.envs import make_env
 from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.on_policy import OnPolicyConfig, _make_optimizer
 from mjx_walk.peers import restore_device_put_replicated
 
 SMALL = PPOConfig(
@@ -42,14 +46,13 @@ class Sizes(Env):
 def test_update_equals_brax(monkeypatch):
     """Brax's own trainer, given our initial networks and our transitions, ends at our parameters.
 
-    The shuffle is fixed and the entropy bonus off, since the two draw their keys in another order. The batch has no
-    truncation, which Brax masks and we bootstrap.
+    The shuffle is fixed and the entropy bonus off, since the two draw their keys in another order. No episode
+    is cut off in so few steps, which Brax masks and we bootstrap.
     """
     config = dataclasses.replace(SMALL, entropy_cost=0.0, observation_clip=None, stagger_episodes=False)
     task = make_env("walker2d", physics="c")
     algorithm = make_ppo(task, 32, EvaluationConfig(1), config)
     state, batch = jax.jit(algorithm.collect)(jax.jit(algorithm.init)(jax.random.PRNGKey(0)))
-    assert batch.transitions.discount.min() >= 0 and batch.stats["episodes"] >= 0
 
     def fixed_order(key, x, *args, **kwargs):
         return jnp.arange(x) if isinstance(x, int) else x
@@ -155,15 +158,57 @@ def test_linear_schedule_has_its_own_horizon():
     np.testing.assert_allclose(rates, [1.0, 0.75, 0.5, 0.25, 0.0], atol=1e-6)
 
 
-def test_learning_uses_the_terminal_value_only_where_truncated():
-    """A batch in which every episode is cut off pays the lost value; one that terminates does not."""
-    task = make_env("humanoid_standup", physics="c", max_episode_steps=4)
-    config = dataclasses.replace(SMALL, num_minibatches=2, stagger_episodes=False, reward_scale=0.01)
+@pytest.mark.parametrize(("task", "lost"), [(EndlessReward(2), 1.0), (ConstantReward(), 0.0)])
+def test_a_step_that_is_cut_off_is_paid_the_lost_value_and_one_that_terminates_is_not(task, lost):
+    """Rewards are 1; the lost value is γ V(s') in the unscaled units of rewards."""
+    config = dataclasses.replace(SMALL, unroll_length=4, stagger_episodes=False, reward_scale=0.5, discount=0.9)
     algorithm = make_ppo(task, 4, EvaluationConfig(1), config)
-    state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
+    state = algorithm.init(jax.random.PRNGKey(0))
+    value_params = jax.tree.map(lambda x: x + 0.1, state.params.value)  # which are worth nothing at an observation of 0
+    state = state.replace(params=state.params.replace(value=value_params))
     _, batch = jax.jit(algorithm.collect)(state)
-    ended = batch.transitions.discount == 0
-    np.testing.assert_array_equal(ended, np.tile([False, False, False, True] * 2, (4, 1)))
-    plain = jnp.where(ended, jnp.nan, batch.transitions.reward)
-    jump = batch.transitions.reward[:, 3] - plain[:, 2]
-    assert (jnp.abs(jump) > 0.5).all()  # γ·V(s') / 0.01 on top of a reward that hardly changes in a step
+    value_network = networks.make_ppo_networks(task, config).value_network
+    value = float(value_network.apply(state.normalizer, value_params, jnp.zeros((1, 1)))[0])
+    ended = np.asarray(batch.transitions.discount) == 0
+    assert abs(value) > 0.05 and ended.any()
+    np.testing.assert_allclose(batch.transitions.reward, 1.0 + lost * ended * 0.9 * value / 0.5, rtol=1e-4)
+
+
+def test_the_values_gradient_is_clipped_to_its_own_norm():
+    optimizer = _make_optimizer(OnPolicyConfig(max_policy_grad_norm=1.0, max_value_grad_norm=0.25))
+    params = PPONetworkParams(policy=jnp.zeros(1), value=jnp.zeros(1))
+    _, state = optimizer.update(jax.tree.map(lambda x: x + 8.0, params), optimizer.init(params))
+    moments = sorted(float(x[0]) for x in jax.tree.leaves(state) if x.shape == (1,))
+    # First moments are a tenth of the clipped gradients, second ones a thousandth of their squares.
+    np.testing.assert_allclose(moments, [0.001 * 0.25**2, 0.001, 0.1 * 0.25, 0.1], rtol=1e-3)
+
+
+def test_the_entropy_bonus_falls_and_rewards_are_normalised_by_what_was_seen_before(monkeypatch):
+    """As Brax's loss is told them; the metrics carry it out."""
+
+    def loss(params, *_, entropy_cost, reward_scaling, **__):
+        names = ("total_loss", "kl_mean", "policy_dist_mean_std")
+        zero = jnp.float32(0.0)
+        told = {"v_loss": jnp.float32(entropy_cost), "policy_loss": jnp.float32(reward_scaling)}
+        return zero, dict.fromkeys(names, zero) | told
+
+    monkeypatch.setattr("mjx_walk.algos.ppo.ppo_losses.compute_ppo_loss", loss)
+    settings = {
+        "unroll_length": 4,
+        "num_minibatches": 1,
+        "num_epochs": 1,
+        "reward_scale": 2.0,
+        "normalize_rewards": True,
+    }
+    schedule = {"entropy_cost": 0.5, "entropy_schedule": "linear", "schedule_steps": 2 * 4 * 4}
+    config = dataclasses.replace(SMALL, **settings, **schedule)
+    algorithm = make_ppo(EndlessReward(), 4, EvaluationConfig(1), config)
+    state, costs = algorithm.init(jax.random.PRNGKey(0)), []
+    collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
+    for _ in range(3):
+        expected = 2.0 * float(returns.reward_multiplier(state.return_scale))
+        state, metrics = learn(*collect(state))
+        costs.append(float(metrics["value_loss"]))
+        assert float(metrics["policy_loss"]) == pytest.approx(expected, rel=1e-5)
+    np.testing.assert_allclose(costs, [0.5, 0.25, 0.0])
+    assert expected < 1.9  # of returns of up to 8

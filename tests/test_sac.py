@@ -1,19 +1,23 @@
-"""SAC: its update equals Brax's."""
+"""SAC: its update equals Brax's, and what it has beyond it."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from brax.training import acting
 from brax.training.agents.sac import networks as brax_networks
 from brax.training.agents.sac import train as brax_sac
 from test_ppo import Sizes
+from toy_tasks import ToyTask
 
-from mjx_walk.algos.sac import SACConfig, make_sac
+from mjx_walk.algos.sac import SACConfig, make_sac, make_sac_learner
 from mjx_walk.envs import make_env
 from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.off_policy import Batch
 from mjx_walk.peers import restore_device_put_replicated
 from mjx_walk.replay import ReplayBuffer
+from mjx_walk.types import Transition
 
 NUM_ENVS, BATCH, UPDATES = 16, 32, 5
 
@@ -121,6 +125,36 @@ def test_update_equals_brax(monkeypatch):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6), result, expected)
     np.testing.assert_allclose(ours.normalizer.mean, theirs.normalizer_params.mean, rtol=1e-5, atol=1e-6)
     assert metrics["alpha"] == pytest.approx(float(jnp.exp(theirs.alpha_params)), rel=1e-2)
+
+
+def batch(remaining=1.0):
+    """Transitions that are all zeros."""
+    obs = jnp.zeros((64, 1))
+    zero = obs[:, 0]
+    data = Transition(obs, obs, zero, zero, obs, {"state_extras": {"truncation": zero}})
+    return Batch(data, jnp.float32(1.0), 1.0, remaining)
+
+
+def test_the_target_entropy_moves_over_the_schedule():
+    """A new policy has less than 0.68 nats and more than -100, which is two thirds of the way at the half still."""
+    learner = make_sac_learner(ToyTask(), SACConfig(target_entropy=-100.0, final_target_entropy=0.68))
+    state = learner.init(jax.random.PRNGKey(0))
+    update = jax.jit(lambda left: learner.full_update(state, batch(left), jax.random.PRNGKey(0))[0].log_alpha)
+    moved = [float(update(jnp.float32(left)) - state.log_alpha) for left in (1.0, 0.5, 0.0)]
+    assert moved[0] < 0 and moved[1] < 0 < moved[2]
+
+
+def test_gradients_are_clipped():
+    """Adam's first moments are a tenth of them."""
+    for limit, is_clipped in ((1e-3, True), (None, False)):
+        learner = make_sac_learner(ToyTask(), SACConfig(max_grad_norm=limit))
+        state = learner.init(jax.random.PRNGKey(0))
+        data = batch()._replace(reward_scale=jnp.float32(1.0))
+        data = data._replace(transitions=data.transitions._replace(reward=jnp.full(64, 100.0)))
+        after, _ = jax.jit(learner.full_update)(state, data, jax.random.PRNGKey(0))
+        moments = [optax.tree.get(after.critic_optimizer, "mu"), optax.tree.get(after.policy_optimizer, "mu")]
+        norms = [float(optax.global_norm(part)) for part in moments]
+        assert (max(norms) < 1.01e-4) is is_clipped and min(norms) > 0
 
 
 def _as_brax(critics):

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from toy_tasks import ToyTask
 
@@ -84,6 +85,14 @@ def test_td3_full_update_moves_policy_and_targets(loud_noise):
     ):
         expected = jax.tree.map(lambda t, p: 0.75 * t + 0.25 * p, old, moved)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), target, expected)
+
+
+def test_gradients_are_clipped(loud_noise):
+    """Adam's first moments are a tenth of them."""
+    learner, state = make(TD3Config(**LINEAR, max_grad_norm=1e-3), 2, 0.2, 0.5)
+    new, _ = learner.full_update(state, batch(), jax.random.PRNGKey(0))
+    for optimizer in (new.critic_optimizer, new.policy_optimizer):
+        assert 0 < float(optax.global_norm(optax.tree.get(optimizer, "mu"))) < 1.01e-4
 
 
 def test_ddpg_has_one_critic_and_no_smoothing(loud_noise):

@@ -20,7 +20,8 @@ from mjx_walk.errors import UserError
 from mjx_walk.live_evaluation import EvaluationConfig
 from mjx_walk.loop import make_init
 from mjx_walk.metrics import read_rows
-from mjx_walk.team import OWN, in_place
+from mjx_walk.off_policy import OffPolicyConfig
+from mjx_walk.team import OWN, in_place, per_device
 from mjx_walk.team_checkpoint import restore_newest
 
 KEY = jax.random.PRNGKey(0)
@@ -66,6 +67,11 @@ def test_two_devices_learn_what_one_learns_from_both_batches():
         assert_close(jax.tree.map(lambda x: x[0], both), getattr(alone, name))
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), alone.params, state.params)
     assert max(jax.tree.leaves(moved)) > 1e-4
+
+
+def test_each_device_counts_its_own_share_of_the_steps():
+    part = per_device(OffPolicyConfig(schedule_steps=101, prefill_steps=8, batch_size=64), 2)
+    assert (part.schedule_steps, part.prefill_steps, part.batch_size) == (51, 4, 64)
 
 
 def test_running_statistics_are_of_all_devices():

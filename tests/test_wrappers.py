@@ -123,3 +123,14 @@ def test_live_evaluation_equals_an_evaluation_on_its_own(walker):
     assert state.live.alive.all()
     _, unfinished = env.renew(state, jax.random.PRNGKey(2), (), jnp.int32(8))
     assert np.isnan(unfinished["eval_return"])
+
+
+def test_the_best_policy_is_the_one_that_was_scored_best(walker):
+    evaluator = LiveEvaluator(walker, 2, EvaluationConfig(2), still(walker), steps_per_update=1)
+    starts = jax.vmap(walker.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
+    live = evaluator.init(jnp.float32(0.0), starts)
+    for update, score in enumerate((1.0, 3.0, 2.0), start=1):
+        live = live.replace(alive=jnp.zeros(2, bool), returns=jnp.full(2, score))
+        live, _ = evaluator.next_round(live, jnp.float32(update), jnp.int32(update), starts)
+    # The second round's is the one that was the present policy when the first one ended.
+    assert (float(live.best_policy_params), int(live.best_update), float(live.best_return)) == (1.0, 1, 3.0)

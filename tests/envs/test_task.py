@@ -47,6 +47,22 @@ def test_broken_physics_ends_the_episode_and_reaches_nobody(name):
     assert sound.metrics["nonfinite"] == 0 and not bool(sound.terminated)
 
 
+def test_velocities_beyond_mujocos_limit_are_broken():
+    """Of 1e10, where MuJoCo itself begins an episode anew."""
+    task = make_env("walker2d", physics="c")
+    state, step = task.reset(jax.random.PRNGKey(0)), task.engine.step
+    for excess, is_broken in ((0.9e10, False), (1.1e10, True)):
+        task.engine.step = lambda *args, excess=excess: _faster(step(*args), excess)
+        after = task.step(state, jnp.zeros(6))
+        assert after.metrics["nonfinite"] == is_broken and bool(after.terminated) >= is_broken
+        assert (after.reward == 0) == is_broken
+
+
+def _faster(stepped, excess):
+    physics, *rest = stepped
+    return physics._replace(qvel=physics.qvel.at[-1].add(excess)), *rest
+
+
 def test_an_action_that_is_not_a_number_is_caught():
     task = make_env("humanoid", physics="c")
     state = task.reset(jax.random.PRNGKey(0))

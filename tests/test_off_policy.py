@@ -1,0 +1,79 @@
+"""What the off-policy loop hands its learner, told by one that does nothing else."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy_tasks import EndlessReward, ToyTask
+
+from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.off_policy import Learner, OffPolicyConfig, make_off_policy
+
+NUM_ENVS = 4
+
+
+class FarAway(ToyTask):
+    """Observations of -1000 and 1000 by turns."""
+
+    def start(self, key):
+        return jnp.full(1, -1000.0), jnp.zeros(1)
+
+    def move(self, qpos, qvel, action, steps):
+        return -qpos, qvel, 1.0, False
+
+
+def told(task, num_updates, **changes):
+    """State and metrics, those of all updates, of a learner whose policy is the observation, bounded by its sight."""
+
+    def tell(state, batch, key):
+        largest = jnp.abs(batch.transitions.observation).max()
+        rate = jnp.float32(batch.rate_factor)
+        return state, {"rate": rate, "largest_observation": largest, "scale": batch.reward_scale}
+
+    def act(params, obs, key, deterministic=True):
+        return 0.01 * obs
+
+    learner = Learner(lambda key: jnp.zeros(1), lambda state: state, act, act, tell, tell)
+    settings = {"unroll_length": 2, "updates_per_step": 1, "batch_size": 64, "replay_capacity": 64, "prefill_steps": 0}
+    config = OffPolicyConfig(**settings | changes)
+    algorithm = make_off_policy(task, NUM_ENVS, EvaluationConfig(1), config, learner)
+    state, rows = algorithm.init(jax.random.PRNGKey(0)), []
+    update = jax.jit(lambda state: algorithm.learn(*algorithm.collect(state)))
+    for _ in range(num_updates):
+        state, metrics = update(state)
+        rows.append(metrics)
+    return algorithm, state, {name: np.stack([row[name] for row in rows]) for name in metrics}
+
+
+@pytest.mark.parametrize(("schedule", "rates"), [("linear", [1.0, 0.75, 0.5, 0.25, 0.0]), ("constant", [1.0] * 5)])
+def test_learning_rates_follow_their_schedule(schedule, rates):
+    settings = {"learning_rate_schedule": schedule, "schedule_steps": 4 * 2 * NUM_ENVS}
+    _, _, metrics = told(EndlessReward(), 5, **settings)
+    np.testing.assert_allclose(metrics["rate"], rates)
+
+
+def test_normalised_rewards_keep_the_largest_return_within_its_bound():
+    """A reward of 1 at each step for 10 steps: the largest discounted return is more than the std of all."""
+    _, state, metrics = told(EndlessReward(10), 12, normalize_rewards=True, return_bound=0.5, reward_scale=2.0)
+    largest = float(state.return_scale.largest)
+    assert largest == pytest.approx(sum(0.99**i for i in range(10)), rel=1e-5)
+    assert metrics["scale"][-1] == pytest.approx(2.0 * 0.5 / largest, rel=1e-5)
+    _, state, metrics = told(EndlessReward(10), 12, reward_scale=2.0)
+    np.testing.assert_array_equal(metrics["scale"], 2.0)
+
+
+def test_actions_are_random_until_the_replay_is_filled():
+    """The policy acts 0 on this task."""
+    _, state, _ = told(EndlessReward(), 3, prefill_steps=2 * 2 * NUM_ENVS)
+    actions = np.asarray(state.replay.action[:6])
+    assert (actions[:4] != 0.0).all() and len(np.unique(actions[:4])) == 4 * NUM_ENVS
+    np.testing.assert_array_equal(actions[4:], 0.0)
+
+
+@pytest.mark.parametrize(("clip", "seen"), [(0.5, 0.5), (None, 1000.0)])
+def test_observations_are_clipped_where_the_policy_acts_and_where_it_learns(clip, seen):
+    algorithm, state, metrics = told(FarAway(), 2, observation_clip=clip, normalize_observations=False)
+    assert metrics["largest_observation"][-1] == seen
+    assert float(jnp.abs(state.replay.action[:4]).max()) == pytest.approx(0.01 * seen)
+    acted = algorithm.policy(algorithm.policy_params(state))(jnp.full((1, 1), 60.0), jax.random.PRNGKey(0))
+    assert float(acted[0, 0]) == pytest.approx(0.01 * min(seen, 60.0))
