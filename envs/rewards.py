@@ -84,7 +84,9 @@ def load_reward_function(source: str) -> RewardFunction:
     """
     path, name = reward_file(source), source.rpartition(":")[2]
     if not path.is_file():
-        raise UserError(f"env.reward_function={source}: no file '{path}'; write PATH.py:FUNCTION")
+        raise UserError(
+            f"env.reward_function={source}: no file '{path if path.name else source}'; write PATH.py:FUNCTION"
+        )
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:
         raise UserError(f"env.reward_function={source}: '{path}' is not a Python file")

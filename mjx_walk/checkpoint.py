@@ -129,7 +129,7 @@ def read_meta(path: Path) -> dict[str, Any]:
 
 def list_steps(folder: Path) -> list[Path]:
     """Checkpoints of a run, oldest first. Their names are zero-padded environment steps."""
-    return sorted(path for path in folder.glob("[0-9]*") if path.is_dir())
+    return sorted(path for path in folder.glob("[0-9]*") if path.name.isdecimal() and path.is_dir())
 
 
 def step_path(folder: Path, env_steps: int) -> Path:

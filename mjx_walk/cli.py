@@ -5,6 +5,7 @@ import difflib
 import errno
 import sys
 import typing
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -129,12 +130,25 @@ def stay_on_cpu() -> None:
     jax.config.update("jax_platforms", "cpu")
 
 
+_usual_format = warnings.formatwarning
+
+
+def _in_one_line(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """A warning that is meant for the user without the line of code that it came from."""
+    if category is UserWarning:
+        return f"warning: {message}\n"
+    return _usual_format(message, category, filename, lineno, line)
+
+
 _DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
 
 
 def main(command: Callable[[list[str]], int | None]) -> NoReturn:
     """Run a command on the process's arguments and exit with its code; a mistake, a disk that is full or must not be
-    written to, and Ctrl-C cost one line."""
+    written to, and Ctrl-C cost one line, and so does a warning."""
+    warnings.formatwarning = _in_one_line
     try:
         sys.exit(command(sys.argv[1:]) or 0)
     except UserError as error:

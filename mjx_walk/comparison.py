@@ -3,8 +3,10 @@
 import csv
 import dataclasses
 import json
+import warnings
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import matplotlib.figure
 import numpy as np
@@ -42,14 +44,24 @@ def read_runs(folder: Path) -> list[Curve]:
         run = RunFolder(path.parent)
         rows = read_rows(run.metrics)
         if rows:
-            scores = json.loads(run.gymnasium_scores.read_text()) if run.gymnasium_scores.exists() else None
-            runs.append(Curve(read_config(path), rows, scores))
+            runs.append(Curve(read_config(path), rows, _scores(run)))
     if not runs:
         raise UserError(f"no runs below '{folder}' have logged anything yet")
     names = {f"{run.config.env.name} {run.config.env.version}" for run in runs}
     if len(names) > 1:
         raise UserError(f"the runs below '{folder}' are of different environments: {', '.join(sorted(names))}")
     return runs
+
+
+def _scores(run: RunFolder) -> dict[str, Any] | None:
+    """What is in a run's `eval_gymnasium.json`, if it has one that can be read."""
+    if not run.gymnasium_scores.exists():
+        return None
+    try:
+        return json.loads(run.gymnasium_scores.read_text())
+    except ValueError:
+        warnings.warn(f"{run.gymnasium_scores} cannot be read: score the run again", stacklevel=2)
+        return None
 
 
 def group(runs: list[Curve]) -> dict[str, list[Curve]]:

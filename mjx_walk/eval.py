@@ -4,6 +4,7 @@ import dataclasses
 
 from mjx_walk import cli, run_folder, zoo
 from mjx_walk.api import load_run
+from mjx_walk.errors import UserError
 from mjx_walk.settings import setting
 
 USAGE = """
@@ -26,6 +27,8 @@ class Arguments:
 def main(arguments: list[str]) -> None:
     """Evaluate and print."""
     parsed = cli.parse(Arguments, arguments, USAGE)
+    if parsed.physics and parsed.backend == "gymnasium":
+        raise UserError(f"physics={parsed.physics} needs backend=sim: Gymnasium has an engine of its own")
     folder = run_folder.open_existing(parsed.run)
     run = load_run(folder.path, parsed.physics)
     is_kept = parsed.backend == "gymnasium" and not zoo.holds(folder.path)

@@ -4,6 +4,7 @@ import collections
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Callable
 
 import jax
@@ -188,7 +189,10 @@ class Trainer:
         init = make_init(self.algorithm)
         key = keys[0] if len(keys) == 1 else jnp.stack(keys)
         if not self.config.resume or not any(list_steps(folder.checkpoints) for folder in self._folders):
-            return init(key), 0  # perhaps of a run that was stopped before it had saved anything
+            for folder in self._folders:
+                if self.config.resume and folder.metrics.exists():  # of a run that was stopped before it had saved
+                    warnings.warn(f"{folder.path} holds no checkpoint; it begins again", stacklevel=2)
+            return init(key), 0
         like = jax.eval_shape(init, key)
         if self._has_axis:
             like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), like)

@@ -5,6 +5,7 @@ import json
 import math
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -116,16 +117,27 @@ class MetricsWriter:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """All rows of a `metrics.jsonl`; a last line cut off by a crash is left out."""
+    """All rows of a `metrics.jsonl`. What is no row is left out, with a warning unless it is a last line cut off by a
+    crash."""
     if not path.exists():
         return []
+    lines = path.read_text(errors="replace").splitlines()
     rows = []
-    for line in path.read_text().splitlines():
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            break
+    for number, line in enumerate(lines, start=1):
+        row = _as_row(line)
+        if row:
+            rows.append(row)
+        elif number < len(lines):
+            warnings.warn(f"line {number} of {path} cannot be read, and is left out", stacklevel=2)
     return rows
+
+
+def _as_row(line: str) -> Row | None:
+    try:
+        row = json.loads(line)
+    except json.JSONDecodeError:
+        return None
+    return row if isinstance(row, dict) and "env_steps" in row else None
 
 
 def write_csv(rows: list[Row], path: Path) -> Path:

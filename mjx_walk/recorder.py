@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_walk import checkpoint
-from mjx_walk.config import Config
+from mjx_walk.config import Config, save_config
 from mjx_walk.envs import Task
 from mjx_walk.evaluation import Scores, score_in_gymnasium
 from mjx_walk.filming import Filmer
@@ -60,7 +60,10 @@ class Recorder:
         return state, facts
 
     def begin(self, env_steps: int, trains_on: bool) -> None:
-        """Open the log, after `env_steps` if the run is resumed; an old score is forgotten if the run trains on."""
+        """Open the log, after `env_steps` if the run is resumed, and keep the settings that it is resumed with; an old
+        score is forgotten if the run trains on."""
+        if self.config.resume:
+            save_config(self.config, self._folder.config)
         self._writer = MetricsWriter(self._folder.path, env_steps if self.config.resume else None)
         self._wandb = WandbLog(self.config, self._folder) if self.config.wandb_project else None
         if trains_on:

@@ -95,7 +95,8 @@ def prepare(configs: list[Config]) -> tuple[list[RunFolder], list[Config]]:
     for folder, config in zip(folders, configs, strict=True):
         try:
             folder.checkpoints.mkdir(parents=True, exist_ok=config.resume)
-            save_config(config, folder.config)
+            if not config.resume:  # else once there is a checkpoint to go on from
+                save_config(config, folder.config)
         except OSError as error:
             raise UserError(f"cannot write to run_dir={config.run_dir}: {error.strerror}") from error
     return folders, configs
@@ -125,6 +126,10 @@ def _check(folder: RunFolder, config: Config) -> None:
     differing = differences(saved, config)
     if differing:
         raise UserError(f"resume=true with another configuration than {folder.config}: {'; '.join(differing)}")
+    if folder.gymnasium_scores.exists() and not list_steps(folder.checkpoints):
+        raise UserError(
+            f"no checkpoint in {folder.checkpoints}, though the run was scored; begin it in another run_dir"
+        )
     if config.total_steps < saved.total_steps:
         raise UserError(f"total_steps={config.total_steps} is below this run's {saved.total_steps}; it may only grow")
 

@@ -15,10 +15,20 @@ def require_wandb(config: Config) -> None:
     """Before a run begins that is to be logged there.
 
     Raises:
-        UserError: the package is not installed.
+        UserError: the package is not installed, or nobody is logged in.
     """
-    if config.wandb_project and importlib.util.find_spec("wandb") is None:
+    if not config.wandb_project:
+        return
+    if importlib.util.find_spec("wandb") is None:
         raise UserError(f"wandb_project={config.wandb_project} needs Weights & Biases: pip install wandb")
+    import wandb
+
+    if wandb.setup().settings.mode == "online":
+        try:
+            wandb.login()
+        except wandb.errors.UsageError as error:
+            advice = "log in with `wandb login`, or set WANDB_MODE=offline"
+            raise UserError(f"wandb_project={config.wandb_project}: {advice}") from error
 
 
 class WandbLog:

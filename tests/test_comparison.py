@@ -97,6 +97,15 @@ def test_runs_are_grouped_by_what_sets_them_apart(tmp_path):
     assert (tmp_path / "comparison.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_scores_that_cannot_be_read_cost_the_comparison_nothing_else(tmp_path):
+    for seed in (0, 1):
+        fake_run(tmp_path / str(seed), ["env=walker2d", f"seed={seed}"], [1, 2], score=5.0)
+    (tmp_path / "0" / "eval_gymnasium.json").write_text('{"mean": 5')
+    with pytest.warns(UserWarning, match=r"eval_gymnasium\.json cannot be read: score the run again"):
+        runs = comparison.read_runs(tmp_path)
+    assert [run.scores and run.scores["mean"] for run in runs] == [None, 5.0]
+
+
 def test_runs_of_different_environments_do_not_mix(tmp_path):
     fake_run(tmp_path / "a", ["env=walker2d"], [1])
     fake_run(tmp_path / "b", ["env=humanoid"], [1])

@@ -147,13 +147,36 @@ def test_signals_finish_the_chunk_save_and_say_how_to_go_on(tmp_path, name):
     assert resolve([f"run_dir={run_dir}", "resume=true"]).env.name == "walker2d"
 
 
+def test_a_resume_that_fails_changes_nothing(tmp_path):
+    run_dir = tmp_path / "run"
+    train_here(run_dir, f"total_steps={2 * TINY_CHUNK}")
+    path = checkpoint.step_path(run_dir / "checkpoints", 2 * TINY_CHUNK)
+    shutil.copytree(path, f"{path}.copy")  # which is no checkpoint of the run
+    flip_a_byte(path)
+    before = (run_dir / "config.yaml").read_text()
+    with pytest.warns(UserWarning, match="damaged"):
+        assert command_here("train", f"run_dir={run_dir}", "resume=true", f"total_steps={9 * TINY_CHUNK}") == 2
+    assert (run_dir / "config.yaml").read_text() == before
+
+
+def test_a_run_that_was_scored_and_has_no_checkpoint_is_not_begun_again(tmp_path, capsys):
+    run_dir = tmp_path / "run"
+    train_here(run_dir, f"total_steps={TINY_CHUNK}", "evaluation.gymnasium_episodes=1")
+    shutil.rmtree(run_dir / "checkpoints")
+    before = {path.name: path.read_bytes() for path in run_dir.iterdir() if path.is_file()}
+    assert command_here("train", f"run_dir={run_dir}", "resume=true") == 2
+    assert "no checkpoint in" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in run_dir.iterdir() if path.is_file()} == before
+
+
 def test_a_run_that_saved_nothing_begins_again(tmp_path):
     run_dir = tmp_path / "run"
     train_here(run_dir, f"total_steps={2 * TINY_CHUNK}")
     whole = leaves(run_dir, 2)
     shutil.rmtree(run_dir / "checkpoints")
     (run_dir / "checkpoints").mkdir()
-    train_here(run_dir, "resume=true", tiny=[])
+    with pytest.warns(UserWarning, match="holds no checkpoint; it begins again"):
+        train_here(run_dir, "resume=true", tiny=[])
     again = leaves(run_dir, 2)
     for name, leaf in whole.items():
         np.testing.assert_array_equal(leaf, again[name], err_msg=name)

@@ -2,9 +2,10 @@
 
 import importlib.util
 import json
+import subprocess
 
 import pytest
-from commands import TINY, TINY_CHUNK
+from commands import TINY, TINY_CHUNK, command
 from wandb.proto.wandb_internal_pb2 import Record
 
 import mjx_walk.api
@@ -67,3 +68,12 @@ def test_without_the_package_nothing_is_begun(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="wandb_project=walking needs Weights & Biases: pip install wandb"):
         mjx_walk.run([*TINY, f"run_dir={tmp_path}/run", "wandb_project=walking"])
     assert not (tmp_path / "run").exists()
+
+
+def test_without_a_login_nothing_is_begun(tmp_path):
+    """In a process of its own, which has no terminal to ask."""
+    env = {"HOME": str(tmp_path), "WANDB_MODE": "online", "WANDB_SILENT": "true", "WANDB_API_KEY": ""}
+    arguments = [*TINY, f"run_dir={tmp_path}/run", "wandb_project=walking"]
+    done = command("train", *arguments, env=env, stdin=subprocess.DEVNULL)
+    assert done.returncode == 2 and not (tmp_path / "run").exists()
+    assert done.stderr == "error: wandb_project=walking: log in with `wandb login`, or set WANDB_MODE=offline\n"
