@@ -36,8 +36,10 @@ def first_chunk_times(overrides: list[str]) -> dict[str, float]:
 
 
 def speeds_by_devices(overrides: list[str], sizes: list[int], seconds: float) -> dict[int, float]:
-    """Environment steps per second of one training on so many GPUs, each with `num_envs` copies; the first chunk, in
-    which they compile, is not counted.
+    """Environment steps per second of one training on so many GPUs, each with `num_envs` copies.
+
+    From the end of the second chunk on: in the first one programs are compiled, and those that look at its results are
+    when it has ended.
 
     Args:
         overrides: as for `train`.
@@ -50,13 +52,14 @@ def speeds_by_devices(overrides: list[str], sizes: list[int], seconds: float) ->
     """
 
     def are_enough(rows: list[Row]) -> bool:
-        return len(rows) > _MIN_CHUNKS and rows[-1]["wall_seconds"] - rows[0]["wall_seconds"] >= seconds
+        counted = rows[1:]
+        return len(counted) > _MIN_CHUNKS and counted[-1]["wall_seconds"] - counted[0]["wall_seconds"] >= seconds
 
     speeds = {}
     for size in sizes:
         # Asked to stop, since it stops its processes then.
         rows = _rows_of([*overrides, f"total_steps={_ENDLESS}", f"devices={size}"], are_enough, signal.SIGTERM)
-        steps, time_taken = (rows[-1][name] - rows[0][name] for name in ("env_steps", "wall_seconds"))
+        steps, time_taken = (rows[-1][name] - rows[1][name] for name in ("env_steps", "wall_seconds"))
         speeds[size] = steps / time_taken
     return speeds
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import pytest
 from commands import command, command_here
 
+from mjx_walk import trial_runs
 from mjx_walk.bench import device_counts
 from mjx_walk.profile import matmul_flops
 
@@ -42,6 +43,19 @@ def test_devices_are_doubled_up_to_those_asked_for(capsys):
     assert [device_counts(asked) for asked in (None, 1, 4, 6)] == [[], [1], [1, 2, 4], [1, 2, 4, 6]]
     assert command_here("bench", "env=walker2d", "devices=0") == 2
     assert capsys.readouterr().err.startswith("error: devices=0: write devices=all, or a number")
+
+
+def test_a_speed_is_that_after_everything_is_compiled(monkeypatch):
+    """Chunks of 100 steps: after 40 s of compiling, 5 s more for what looks at results, then 2 s each."""
+    rows = [{"env_steps": 100 * (i + 1), "wall_seconds": float(at)} for i, at in enumerate([40, 47, 49, 51, 53, 55])]
+
+    def logged(arguments, are_enough, *_):
+        assert "devices=2" in arguments
+        return next(rows[:count] for count in range(1, 7) if are_enough(rows[:count]))
+
+    monkeypatch.setattr(trial_runs, "_rows_of", logged)
+    assert trial_runs.speeds_by_devices(["env=humanoid"], [2], seconds=1) == {2: 50.0}
+    assert trial_runs.speeds_by_devices(["env=humanoid"], [2], seconds=8) == {2: 50.0}
 
 
 def test_products_are_counted():
