@@ -5,16 +5,19 @@ import json
 import jax
 import jax.numpy as jnp
 import pytest
-from commands import command, command_here
+from commands import TINY, TINY_OFF_POLICY, command, command_here
 
 from mjx_walk import trial_runs
 from mjx_walk.bench import device_counts
 from mjx_walk.profile import matmul_flops
 
 
-@pytest.mark.parametrize(("algo", "sizes"), [("ppo", []), pytest.param("td3", [1, 2], marks=pytest.mark.slow)])
-def test_bench_measures_and_writes(tmp_path, algo, sizes):
-    arguments = ("env=walker2d", f"algo={algo}", "num_envs=32", "seconds=0.5", f"out={tmp_path}/bench.json")
+@pytest.mark.parametrize(
+    ("algo", "tiny", "sizes"),
+    [("ppo", TINY, []), pytest.param("td3", TINY_OFF_POLICY, [1, 2], marks=pytest.mark.slow)],
+)
+def test_bench_measures_and_writes(tmp_path, algo, tiny, sizes):
+    arguments = (f"algo={algo}", *tiny, "num_envs=32", "seconds=0.5", f"out={tmp_path}/bench.json")
     done = command("bench", *arguments, *(f"devices={size}" for size in sizes[-1:]))
     assert done.returncode == 0, done.stderr
     content = json.loads((tmp_path / "bench.json").read_text())

@@ -12,7 +12,6 @@ from mjx_walk.envs.physics import PhysicsState, make_engine, mjx_warp
 
 CASES = [(name, "v5", "warp") for name in TASKS]
 CASES += [("humanoid", "v4", "warp"), ("walker2d", "v5", "jax")]
-CASES += [pytest.param("humanoid", "v5", "jax", marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize(("name", "version", "physics"), CASES)
@@ -71,7 +70,7 @@ def test_a_wrong_engine_is_noticed():
 def test_reset_observation(physics):
     keys = jax.random.split(jax.random.PRNGKey(0), 4)
     expected = jax.vmap(make_env("humanoid", physics="c").reset)(keys)
-    found = jax.vmap(make_env("humanoid", physics=physics).reset)(keys)
+    found = jax.jit(jax.vmap(make_env("humanoid", physics=physics).reset))(keys)
     np.testing.assert_allclose(found.obs, expected.obs, rtol=2e-5, atol=2e-5)
     np.testing.assert_array_equal(found.obs[:, :22], expected.physics.qpos[:, 2:])  # the raw quaternion
     np.testing.assert_array_equal(found.obs[:, -78:], 0.0)  # no contact forces at reset
