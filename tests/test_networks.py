@@ -1,5 +1,7 @@
 """Networks: what they compute in, and what they hand on."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ from mjx_walk import networks
 from mjx_walk.algos.a2c import A2CConfig
 from mjx_walk.algos.ppo import PPOConfig
 from mjx_walk.algos.sac import SACConfig
+from mjx_walk.config import load_config
 from mjx_walk.envs import make_env
 
 KEY = jax.random.PRNGKey(0)
@@ -27,6 +30,24 @@ def actor_and_critic(config):
         policy, critic = nets.policy_network, nets.value_network
         value = lambda params, obs, action: critic.apply(normalizer, params, obs)  # noqa: E731
     return lambda params, obs: policy.apply(normalizer, params, obs), value, policy.init(KEY), critic.init(KEY)
+
+
+@pytest.mark.parametrize("name", ["humanoid", "walker2d"])
+def test_their_precision_does_not_reach_the_physics(name):
+    """As the products are written down for the compiler, with what training sets for the networks' ones."""
+    task = make_env(name, physics="jax")
+    state = jax.eval_shape(task.reset, KEY)
+    act, _, params, _ = actor_and_critic(PPOConfig())
+
+    def precisions(function, *arguments):
+        text = str(jax.make_jaxpr(function)(*arguments))
+        found = re.findall(r"precision=\(Precision\.(\w+), Precision\.(\w+)\)", text)
+        assert len(found) == text.count("= dot_general[") > 0
+        return {precision for pair in found for precision in pair}
+
+    with jax.default_matmul_precision(load_config([f"env={name}"]).matmul_precision):
+        assert precisions(task.step, state, jnp.zeros(task.action_size)) == {"HIGHEST"}
+        assert precisions(act, params, jnp.zeros(17)) == {"HIGH"}  # which is TF32
 
 
 @pytest.mark.parametrize("make_config", [PPOConfig, A2CConfig, SACConfig])

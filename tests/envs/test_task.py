@@ -1,6 +1,5 @@
 """Purity, vmap, and the guard against broken physics."""
 
-import re
 from pathlib import Path
 
 import gymnasium
@@ -9,8 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_walk import networks
-from mjx_walk.config import load_config
 from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.physics import base
 from mjx_walk.errors import UserError
@@ -71,27 +68,6 @@ def test_an_action_that_is_not_a_number_is_caught():
     state = task.reset(jax.random.PRNGKey(0))
     after = task.step(state, jnp.full(17, jnp.nan))
     assert after.metrics["nonfinite"] == 1 and np.isfinite(after.obs).all() and np.isfinite(after.reward)
-
-
-@pytest.mark.parametrize("name", ["humanoid", "walker2d"])
-def test_the_networks_precision_does_not_reach_the_physics(name):
-    """As the products are written down for the compiler, with what training sets for the networks' ones."""
-    task = make_env(name, physics="jax")
-    state = jax.eval_shape(task.reset, jax.random.PRNGKey(0))
-    config = load_config([f"env={name}"])
-    nets = networks.make_ppo_networks(task, config.algo)
-    params = jax.eval_shape(nets.policy_network.init, jax.random.PRNGKey(0))
-    normalizer = networks.init_normalizer(task.observation_size)
-
-    def precisions(function, *arguments):
-        text = str(jax.make_jaxpr(function)(*arguments))
-        found = re.findall(r"precision=\(Precision\.(\w+), Precision\.(\w+)\)", text)
-        assert len(found) == text.count("= dot_general[") > 0
-        return {precision for pair in found for precision in pair}
-
-    with jax.default_matmul_precision(config.matmul_precision):
-        assert precisions(task.step, state, jnp.zeros(task.action_size)) == {"HIGHEST"}
-        assert precisions(nets.policy_network.apply, normalizer, params, state.obs) == {"HIGH"}  # which is TF32
 
 
 def test_state_is_lean():
