@@ -1,7 +1,7 @@
 """Tests run on the CPU, share one compile cache within a run, and have XLA compile quickly.
 
 A program is compiled for seconds here and runs for less; what calls back into Python, as MuJoCo's C library does, no
-cache can keep. These flags compile it in a third of the time, and leave what it computes within a float's rounding.
+cache can keep. These flags compile it in a third of the time; the tests hold without them, too, but take longer.
 """
 
 import os
