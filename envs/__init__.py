@@ -11,8 +11,9 @@ from mjx_walk.envs.humanoid import Humanoid, HumanoidOptions
 from mjx_walk.envs.humanoid_standup import HumanoidStandup, HumanoidStandupOptions
 from mjx_walk.envs.task import NO_TIME_LIMIT, State, Task, TaskOptions
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
-from mjx_walk.errors import UserError
-from mjx_walk.settings import validate
+from mjx_walk.utils.compat import prepare_jax
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import validate
 
 TASKS: dict[str, tuple[type[Task], type[TaskOptions]]] = {
     "humanoid": (Humanoid, HumanoidOptions),
@@ -34,6 +35,7 @@ def make_env(name: str, physics: str = "auto", **kwargs: Any) -> Task:
     Raises:
         UserError: an unknown name, engine, version or keyword.
     """
+    prepare_jax()
     if name not in TASKS:
         raise UserError(f"unknown env '{name}'; choose one of: {', '.join(TASKS)}")
     task_class, options_class = TASKS[name]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from mjx_walk.envs.humanoid_body import HumanoidBody, HumanoidBodyOptions
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.task import Memory, State
-from mjx_walk.settings import setting
+from mjx_walk.utils.settings import setting
 
 
 @dataclasses.dataclass

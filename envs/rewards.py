@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from mjx_walk.envs.physics import PhysicsState
-from mjx_walk.errors import UserError
-from mjx_walk.settings import setting
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import setting
 
 Terms = dict[str, jax.Array]
 """Signed reward terms, `[] f32` each."""

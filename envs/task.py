@@ -13,8 +13,8 @@ import mujoco
 
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.rewards import RewardStep, Shaping, Terms, load_reward_function, shaping_terms, term_names
-from mjx_walk.errors import UserError
-from mjx_walk.settings import setting
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import setting
 
 MAX_ABS_VALUE = 1e10
 """A position or velocity beyond it is a broken simulation, as in MuJoCo's own check (`mjMAXVAL`)."""

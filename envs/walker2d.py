@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.task import Memory, State, Task, TaskOptions
-from mjx_walk.settings import setting
+from mjx_walk.utils.settings import setting
 
 MAX_OBSERVED_VELOCITY = 10.0
 """Velocities are clipped to it in the observation, m/s and rad/s."""

@@ -3,17 +3,24 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from mjx_walk.registration import register
-from mjx_walk.xla_flags import turn_off_wrong_reductions
+from mjx_walk.interop.registration import register
+from mjx_walk.utils.versions import __version__
 
-__version__ = "0.1.0"
-__all__ = ["__version__", "load_run", "make_env", "run"]
+__all__ = ["BraxEnv", "__version__", "load_run", "make_env", "prepare_jax", "run"]
 
 if TYPE_CHECKING:
     from mjx_walk.api import load_run, run
     from mjx_walk.envs import make_env
+    from mjx_walk.interop.brax_env import BraxEnv
+    from mjx_walk.utils.compat import prepare_jax
 
-_WHERE = {"make_env": "mjx_walk.envs", "run": "mjx_walk.api", "load_run": "mjx_walk.api"}
+_WHERE = {
+    "BraxEnv": "mjx_walk.interop.brax_env",
+    "load_run": "mjx_walk.api",
+    "make_env": "mjx_walk.envs",
+    "prepare_jax": "mjx_walk.utils.compat",
+    "run": "mjx_walk.api",
+}
 
 
 def __getattr__(name: str) -> Any:
@@ -23,5 +30,4 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'mjx_walk' has no attribute '{name}'")
 
 
-turn_off_wrong_reductions()
 register()

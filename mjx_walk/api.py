@@ -9,79 +9,39 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
-from mjx_walk import run_folder
+from mjx_walk import zoo
 from mjx_walk.algos import make_algorithm
-from mjx_walk.capacity import check_replay
-from mjx_walk.config import Config, compile_cache_dir, load_config, read_config
-from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.physics import resolve_engine
-from mjx_walk.envs.rewards import reward_file
-from mjx_walk.errors import UserError
-from mjx_walk.evaluation import Scores, score_in_gymnasium, score_in_sim
-from mjx_walk.interrupt import as_by_ctrl_c
-from mjx_walk.loop import Trainer
-from mjx_walk.metrics import Row, read_rows
-from mjx_walk.policies import deterministic_act, load_best_policy
-from mjx_walk.rendering import choose_opengl
-from mjx_walk.run_folder import RunFolder
-from mjx_walk.team import Team
-from mjx_walk.wandb_log import require_wandb
+from mjx_walk.evaluation.gymnasium_scores import Scores, score_in_gymnasium, score_in_sim
+from mjx_walk.runs import run_folder
+from mjx_walk.runs.config import Config, compile_cache_dir, load_config, read_config
+from mjx_walk.runs.loggers import require_wandb
+from mjx_walk.runs.metrics import Row, read_rows
+from mjx_walk.runs.policies import SavedPolicy, make_task
+from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.training.distributed import Team
+from mjx_walk.training.memory_check import check_replay
+from mjx_walk.training.trainer import Trainer
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.signals import as_by_ctrl_c
+from mjx_walk.viewing.rendering import choose_opengl
 
 
-class Run:
+class Run(SavedPolicy):
     """A run on disk: its configuration, its metrics and its best policy."""
-
-    def __init__(self, folder: RunFolder, physics: str | None = None):
-        """
-        Args:
-            folder: of a run that has saved a policy.
-            physics: another engine than the one it was trained on.
-
-        Raises:
-            UserError: there is no usable policy.
-        """
-        self.path = folder.path
-        self.config = _without_lost_reward(read_config(folder.config))
-        engine = physics or _engine_here(self.config.physics)
-        self.task = make_task(dataclasses.replace(self.config, physics=engine))
-        # It acts in float32, whatever it learned in: the same on every machine.
-        algo = dataclasses.replace(self.config.algo, network_dtype="float32")
-        self._algorithm = make_algorithm(self.task, self.config.num_envs, self.config.evaluation, algo)
-        state = jax.eval_shape(self._algorithm.init, jax.random.PRNGKey(0))
-        like = jax.eval_shape(self._algorithm.policy_params, state)
-        self.policy_params, self.policy_facts = load_best_policy(folder, like)
 
     @functools.cached_property
     def metrics(self) -> list[Row]:
         """All rows of `metrics.jsonl`."""
         return read_rows(self.path / "metrics.jsonl")
 
-    @functools.cached_property
-    def act(self) -> Callable:
-        """`policy` as a compiled JAX function of f32 observations."""
-        return deterministic_act(self._algorithm, self.policy_params)
-
-    def policy(self, obs: np.ndarray) -> np.ndarray:
-        """The deterministic action for one observation or a batch, in Gymnasium's units on both sides.
-
-        Args:
-            obs: `[…, observation_size]`, any float dtype.
-        """
-        return np.asarray(self.act(np.asarray(obs, np.float32)))
-
     def evaluate(self, episodes: int = 100, backend: str = "gymnasium", seed: int = 0) -> Scores:
         """Score the policy without noise; `backend` is `gymnasium` or `sim`, the run's own engine."""
         if backend == "gymnasium":
             return score_in_gymnasium(self.task, self.act, episodes, seed)
-        policy = self._algorithm.policy(self.policy_params, deterministic=True)
+        policy = self.algorithm.policy(self.policy_params, deterministic=True)
         return score_in_sim(self.task, policy, episodes, seed)
-
-
-def make_task(config: Config) -> Task:
-    """The unbatched environment of a configuration."""
-    return TASKS[config.env.name][0](config.env, config.physics)
 
 
 def load_run(path: str | Path, physics: str | None = None) -> Run:
@@ -90,7 +50,7 @@ def load_run(path: str | Path, physics: str | None = None) -> Run:
     Raises:
         UserError: no run, or no usable policy there.
     """
-    return Run(run_folder.open_existing(path), physics)
+    return Run(zoo.open_run(path), physics)
 
 
 def resolve(overrides: list[str]) -> Config:
@@ -203,22 +163,6 @@ def _with_setting(settings: Any, key: str, value: Any) -> Any:
     name, _, rest = key.partition(".")
     own = _with_setting(getattr(settings, name), rest, value) if rest else value
     return dataclasses.replace(settings, **{name: own})
-
-
-def _engine_here(name: str) -> str:
-    """The engine that a run was trained on, or this machine's own, where that one does not run."""
-    try:
-        return resolve_engine(name)
-    except UserError:
-        return "auto"
-
-
-def _without_lost_reward(config: Config) -> Config:
-    """Without a reward function whose file is not there any more: the policy and its score do not need it."""
-    source = config.env.reward_function
-    if source is None or reward_file(source).is_file():
-        return config
-    return dataclasses.replace(config, env=dataclasses.replace(config.env, reward_function=None))
 
 
 def _announce(config: Config, folders: list[RunFolder], num_devices: int) -> None:

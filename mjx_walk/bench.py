@@ -13,19 +13,22 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 
-from mjx_walk import cli, launch, profile, trial_runs
 from mjx_walk.algos import make_algorithm
-from mjx_walk.api import make_task, resolve
-from mjx_walk.config import Config
+from mjx_walk.algos.off_policy import OffPolicyConfig
+from mjx_walk.api import resolve
+from mjx_walk.common.replay_buffer import ReplayBuffer, Steps
 from mjx_walk.envs import State, Task
 from mjx_walk.envs.physics import make_engine
-from mjx_walk.errors import UserError
-from mjx_walk.evaluation import versions
-from mjx_walk.loop import make_chunk, make_init
-from mjx_walk.off_policy import OffPolicyConfig
-from mjx_walk.replay import ReplayBuffer, Steps
-from mjx_walk.settings import setting
-from mjx_walk.types import Algorithm
+from mjx_walk.experiments import profile, timing
+from mjx_walk.runs.config import Config
+from mjx_walk.runs.policies import make_task
+from mjx_walk.training import launcher
+from mjx_walk.training.trainer import make_chunk, make_init
+from mjx_walk.utils import cli
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import setting
+from mjx_walk.utils.types import Algorithm
+from mjx_walk.utils.versions import package_versions
 
 USAGE = """
 usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [KEY=VALUE ...] [seconds=5] [devices=all] [peers=false]
@@ -61,8 +64,8 @@ def main(arguments: list[str]) -> None:
     sizes = device_counts(parsed.devices)
     print("Short trainings, in processes of their own …", flush=True)
     # Before this process takes the device's memory.
-    first_chunks = trial_runs.first_chunk_times(overrides)
-    speeds = trial_runs.speeds_by_devices(overrides, sizes, parsed.seconds)
+    first_chunks = timing.first_chunk_times(overrides)
+    speeds = timing.speeds_by_devices(overrides, sizes, parsed.seconds)
     task = make_task(config)
     device = f"{jax.devices()[0].device_kind}, physics={task.engine.name}, {config.num_envs} copies"
     print(f"{task.gymnasium_id} on {device}", flush=True)
@@ -100,7 +103,7 @@ def main(arguments: list[str]) -> None:
         for name, value, unit in peer_figures(algo, config.hardware):
             report(name, value, unit)
     if parsed.out:
-        content = {"env": task.gymnasium_id, "device": device, "results": results, "versions": versions()}
+        content = {"env": task.gymnasium_id, "device": device, "results": results, "versions": package_versions()}
         Path(parsed.out).write_text(json.dumps(content, indent=1))
 
 
@@ -112,7 +115,7 @@ def device_counts(asked: Any) -> list[int]:
     """
     if asked is None:
         return []
-    most = launch.count(asked)
+    most = launcher.count(asked)
     return sorted({most} | {2**power for power in range(most.bit_length())})
 
 
@@ -219,7 +222,7 @@ def insert_times(task: Task) -> dict[str, float]:
 
 def peer_figures(algo: str, hardware: str) -> list[tuple[str, float, str]]:
     """Names, values and units of what Brax's trainer of the same algorithm reaches on this machine."""
-    from mjx_walk import peers  # Brax's trainers take seconds to import
+    from mjx_walk.experiments import peers  # Brax's trainers take seconds to import
 
     if algo == "ppo":
         ppo_sizes = (2048, 1024, 32, 30) if hardware == "gpu" else (32, 16, 2, 3)

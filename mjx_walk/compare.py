@@ -6,13 +6,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mjx_walk import cells, cli
 from mjx_walk.algos import ALGORITHMS
-from mjx_walk.comparison import write_report
-from mjx_walk.config import Config
-from mjx_walk.errors import UserError
-from mjx_walk.interrupt import exit_code
-from mjx_walk.settings import setting
+from mjx_walk.experiments import planned_runs
+from mjx_walk.experiments.report import write_report
+from mjx_walk.runs.config import Config
+from mjx_walk.utils import cli
+from mjx_walk.utils.devices import count_devices
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import setting
+from mjx_walk.utils.signals import exit_code
 
 USAGE = """
 usage: python -m mjx_walk.compare [env=ENV] ['algos=[ppo,sac,td3]'] [seeds=3] [out=DIR] [KEY=VALUE ...]
@@ -54,15 +56,15 @@ def main(arguments: list[str]) -> int:
     if not own.algos:
         raise UserError(f"algos=[]: choose some of: {', '.join(ALGORITHMS)}")
     seeds = cli.read_seeds(own.seeds)
-    hardware, available = cells.count_devices()
+    hardware, available = count_devices()
     count = own.devices or available
     if count > available:
         raise UserError(f"devices={count}: this machine has {available}")
-    out, planned = cells.plan(overrides, list(own.algos), seeds, own.out, hardware)
+    out, planned = planned_runs.plan(overrides, list(own.algos), seeds, own.out, hardware)
     open_cells = [cell for cell in planned if not cell.is_finished]
     print(f"{len(planned)} runs, {len(planned) - len(open_cells)} of them finished before, in {out}", flush=True)
 
-    def on_end(cell: cells.Cell, log: Path) -> None:
+    def on_end(cell: planned_runs.Cell, log: Path) -> None:
         if not cell.is_finished:
             is_full = "RESOURCE_EXHAUSTED" in log.read_text(errors="replace")[-10_000:]
             hint = "; memory ran out, so try together=1 or a smaller num_envs" if is_full else ""
@@ -77,8 +79,8 @@ def main(arguments: list[str]) -> int:
     slots: list[int | None] = list(range(count)) if hardware == "gpu" else [None]
     slots *= own.per_device
     # Measured with three seeds: 1.9 to 2.4 times as fast as in turn on an H200, 1.0 to 1.1 times on two cores.
-    together = own.together or (cells.most_together(open_cells, len(slots)) if hardware == "gpu" else 1)
-    signal_name = cells.run(cells.jobs(open_cells, together), slots, out / "logs", on_end)
+    together = own.together or (planned_runs.most_together(open_cells, len(slots)) if hardware == "gpu" else 1)
+    signal_name = planned_runs.run(planned_runs.jobs(open_cells, together), slots, out / "logs", on_end)
     if signal_name:
         print(f"Stopped by {signal_name}; the same command goes on.")
         return exit_code(signal_name)

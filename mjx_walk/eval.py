@@ -2,10 +2,11 @@
 
 import dataclasses
 
-from mjx_walk import cli, run_folder, zoo
+from mjx_walk import zoo
 from mjx_walk.api import load_run
-from mjx_walk.errors import UserError
-from mjx_walk.settings import setting
+from mjx_walk.utils import cli
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import setting
 
 USAGE = """
 usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [episodes=100] [backend=gymnasium|sim] [seed=0] [physics=ENGINE]
@@ -29,7 +30,7 @@ def main(arguments: list[str]) -> None:
     parsed = cli.parse(Arguments, arguments, USAGE)
     if parsed.physics and parsed.backend == "gymnasium":
         raise UserError(f"physics={parsed.physics} needs backend=sim: Gymnasium has an engine of its own")
-    folder = run_folder.open_existing(parsed.run)
+    folder = zoo.open_run(parsed.run)
     run = load_run(folder.path, parsed.physics)
     is_kept = parsed.backend == "gymnasium" and not zoo.holds(folder.path)
     if is_kept:

@@ -3,10 +3,11 @@
 import dataclasses
 from pathlib import Path
 
-from mjx_walk import cli, run_folder, zoo
+from mjx_walk import zoo
 from mjx_walk.api import load_run
-from mjx_walk.errors import UserError
-from mjx_walk.settings import setting
+from mjx_walk.utils import cli
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import setting
 
 USAGE = """
 usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [format=onnx] [out=FILE.onnx]
@@ -33,12 +34,12 @@ def main(arguments: list[str]) -> None:
     try:
         import onnx
 
-        from mjx_walk.onnx_graph import translate
+        from mjx_walk.interop.onnx import translate
     except ImportError as error:
         raise UserError("format=onnx needs ONNX: pip install onnx") from error
-    folder = run_folder.open_existing(parsed.run)
+    folder = zoo.open_run(parsed.run)
     run = load_run(parsed.run, "c")
-    path = Path(parsed.out) if parsed.out else folder.product("policy.onnx")
+    path = Path(parsed.out) if parsed.out else zoo.output_path(folder, "policy.onnx")
     cli.check_writable(path)
     model = translate(run.act, run.task.observation_size, f"{run.config.env.name}_{run.config.algo.name}")
     onnx.save(model, str(path))

@@ -5,15 +5,16 @@ from pathlib import Path
 
 import imageio.v3 as iio
 
-from mjx_walk import cli, run_folder, zoo
+from mjx_walk import zoo
 from mjx_walk.api import load_run
-from mjx_walk.episode import record_episode
-from mjx_walk.errors import UserError
-from mjx_walk.gait import draw_gait_sheet, frame_strip
-from mjx_walk.live_viewer import show
-from mjx_walk.page import require_library, write_page
-from mjx_walk.rendering import write_film
-from mjx_walk.settings import setting
+from mjx_walk.utils import cli
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import setting
+from mjx_walk.viewing.episode import record_episode
+from mjx_walk.viewing.gait import draw_gait_sheet, frame_strip
+from mjx_walk.viewing.page import require_library, write_page
+from mjx_walk.viewing.rendering import write_film
+from mjx_walk.viewing.viewer import show
 
 USAGE = """
 usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [seed=0] [width=640] [height=480] [out=FILE.mp4] [html=FILE.html]
@@ -49,12 +50,12 @@ def main(arguments: list[str]) -> None:
     cli.stay_on_cpu()
     if parsed.run is None:
         raise UserError(f"say which run: run=RUN_DIR, or one of run={zoo.PREFIX}{f', {zoo.PREFIX}'.join(zoo.names())}")
-    folder = run_folder.open_existing(parsed.run)
+    folder = zoo.open_run(parsed.run)
     if parsed.html:
         require_library()
     film, html, gait, strip = (Path(p) if p else None for p in (parsed.out, parsed.html, parsed.gait, parsed.strip))
     if not (film or html or gait or strip or parsed.viewer):
-        film = folder.product("episode.mp4")
+        film = zoo.output_path(folder, "episode.mp4")
     cli.check_suffix(film, ".mp4", ".mkv", ".mov", ".avi")
     for image in (gait, strip):
         cli.check_suffix(image, ".png", ".jpg")

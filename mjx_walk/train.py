@@ -12,12 +12,13 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, open_dict
 
-from mjx_walk import cli, launch
 from mjx_walk.api import resolve, resolve_seeds, train
-from mjx_walk.config import CONFIG_DIR, Config, complete_overrides, load_config, register_schemas, to_config
-from mjx_walk.errors import UserError
-from mjx_walk.interrupt import Stopped, exit_code
-from mjx_walk.team import Team, join
+from mjx_walk.runs.config import CONFIG_DIR, Config, complete_overrides, load_config, register_schemas, to_config
+from mjx_walk.training import launcher
+from mjx_walk.training.distributed import Team, join
+from mjx_walk.utils import cli
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.signals import Stopped, exit_code
 
 USAGE = """
 usage: python -m mjx_walk.train [env=humanoid|humanoid_standup|walker2d] [algo=ppo] [KEY=VALUE ...]
@@ -54,10 +55,10 @@ def main(arguments: list[str]) -> int:
         raise UserError("give seeds=… or devices=…, not both")
     team = join() if own.devices is not None else None
     if own.devices is not None and not team:
-        size = launch.count(own.devices)
+        size = launcher.count(own.devices)
         if size > 1:
             resolve(settings)  # says once what is wrong in them
-            return launch.run(arguments, size)
+            return launcher.run(arguments, size)
     if team:
         return _train_in_team(settings, team)
     configs = resolve_seeds(settings, cli.read_seeds(own.seeds)) if own.seeds is not None else [resolve(settings)]

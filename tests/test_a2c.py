@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from toy_tasks import DelayedReward, RewardedAction
 
-from mjx_walk import networks
 from mjx_walk.algos.a2c import A2CConfig, make_a2c
-from mjx_walk.errors import UserError
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.noise import OrnsteinUhlenbeck
-from mjx_walk.policy_gradient import out_of_bounds, policy_gradient_loss, sampled_kl
+from mjx_walk.algos.policy_gradient import out_of_bounds, policy_gradient_loss, sampled_kl
+from mjx_walk.common import networks
+from mjx_walk.common.exploration import OrnsteinUhlenbeck
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.utils.errors import UserError
 
 NUM_ENVS, STEPS = 16, 6
 GAUSSIAN = {"distribution": "normal", "policy_hidden_layer_sizes": (8,), "value_hidden_layer_sizes": (8,)}

@@ -11,15 +11,17 @@ import pytest
 import yaml
 from commands import TINY, TINY_CHUNK, command, command_here
 
-from mjx_walk import api, cli, run_folder
+from mjx_walk import api
 from mjx_walk import bench as bench_command
 from mjx_walk import compare as compare_command
 from mjx_walk import eval as eval_command
 from mjx_walk import train as train_command
 from mjx_walk.algos import ALGORITHMS
-from mjx_walk.config import Config, flatten, load_config
 from mjx_walk.envs import TASKS
-from mjx_walk.errors import UserError
+from mjx_walk.runs import run_folder
+from mjx_walk.runs.config import Config, flatten, load_config
+from mjx_walk.utils import cli
+from mjx_walk.utils.errors import UserError
 
 CASES = [
     (["env=ant"], "unknown env 'ant'; choose one of: humanoid, humanoid_standup, walker2d"),

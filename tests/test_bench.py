@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import pytest
 from commands import TINY, TINY_OFF_POLICY, command, command_here
 
-from mjx_walk import trial_runs
 from mjx_walk.bench import device_counts
-from mjx_walk.profile import matmul_flops
+from mjx_walk.experiments import timing
+from mjx_walk.experiments.profile import matmul_flops
 
 
 @pytest.mark.parametrize(
@@ -56,9 +56,9 @@ def test_a_speed_is_that_after_everything_is_compiled(monkeypatch):
         assert "devices=2" in arguments
         return next(rows[:count] for count in range(1, 7) if are_enough(rows[:count]))
 
-    monkeypatch.setattr(trial_runs, "_rows_of", logged)
-    assert trial_runs.speeds_by_devices(["env=humanoid"], [2], seconds=1) == {2: 50.0}
-    assert trial_runs.speeds_by_devices(["env=humanoid"], [2], seconds=8) == {2: 50.0}
+    monkeypatch.setattr(timing, "_rows_of", logged)
+    assert timing.speeds_by_devices(["env=humanoid"], [2], seconds=1) == {2: 50.0}
+    assert timing.speeds_by_devices(["env=humanoid"], [2], seconds=8) == {2: 50.0}
 
 
 def test_products_are_counted():

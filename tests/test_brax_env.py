@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.wrappers import training
 
-from mjx_walk.brax_env import BraxEnv
 from mjx_walk.envs import make_env
+from mjx_walk.interop.brax_env import BraxEnv
 
 
 def test_brax_wrappers_drive_it():

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_walk import checkpoint
-from mjx_walk.errors import UserError
+from mjx_walk.runs import checkpoint
+from mjx_walk.utils.errors import UserError
 
 TREE = {
     "a": jnp.arange(6, dtype=jnp.float32).reshape(2, 3),

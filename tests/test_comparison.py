@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from commands import ENVIRONMENT, command, command_here
 
-from mjx_walk import cells, comparison
 from mjx_walk import compare as compare_command
-from mjx_walk.config import load_config, save_config
-from mjx_walk.errors import UserError
+from mjx_walk.experiments import planned_runs, report
+from mjx_walk.runs.config import load_config, save_config
+from mjx_walk.utils.errors import UserError
 
 SMALL = (
     *("env=walker2d", "num_envs=8", "algo.unroll_length=8", "algo.num_minibatches=2"),
@@ -39,7 +39,7 @@ def fake_run(folder, overrides, returns, score=None):
 
 def test_variants_are_the_product_of_algorithms_swept_values_and_seeds(tmp_path):
     overrides = ["env=walker2d", "algo.discount=0.9,0.95", "total_steps=1000"]
-    out, planned = cells.plan(overrides, ["ppo", "a2c"], [0, 7], str(tmp_path / "a b's"), "cpu")
+    out, planned = planned_runs.plan(overrides, ["ppo", "a2c"], [0, 7], str(tmp_path / "a b's"), "cpu")
     assert out == tmp_path / "a b's"
     assert [cell.name for cell in planned] == [
         f"{algo}_discount-{discount}/seed_{seed}"
@@ -55,12 +55,13 @@ def test_variants_are_the_product_of_algorithms_swept_values_and_seeds(tmp_path)
 
 
 def test_what_is_named_twice_is_run_once(tmp_path):
-    assert len(cells.plan(["env=walker2d"], ["ppo", "ppo"], [0, 0, 1], str(tmp_path), "cpu")[1]) == 2
+    assert len(planned_runs.plan(["env=walker2d"], ["ppo", "ppo"], [0, 0, 1], str(tmp_path), "cpu")[1]) == 2
 
 
 def test_variants_have_folders_of_their_own(tmp_path):
     def variants(sweep):
-        return [cell.variant for cell in cells.plan(["env=walker2d", sweep], ["sac"], [0], str(tmp_path), "cpu")[1]]
+        planned = planned_runs.plan(["env=walker2d", sweep], ["sac"], [0], str(tmp_path), "cpu")[1]
+        return [cell.variant for cell in planned]
 
     assert variants("algo.target_entropy=-0.5,0.5") == ["sac_target_entropy--0.5", "sac_target_entropy-0.5"]
     assert variants("algo.policy_hidden_layer_sizes=[32,32],[32,64]") == [
@@ -72,7 +73,7 @@ def test_variants_have_folders_of_their_own(tmp_path):
 
 
 def test_the_folder_is_named_after_the_environment_that_is_trained(tmp_path):
-    out, _ = cells.plan(["recipe=report/e_td3"], ["td3"], [0], None, "cpu")
+    out, _ = planned_runs.plan(["recipe=report/e_td3"], ["td3"], [0], None, "cpu")
     assert str(out) == "runs/compare_walker2d"
 
 
@@ -82,14 +83,14 @@ def test_runs_are_grouped_by_what_sets_them_apart(tmp_path):
         fake_run(tmp_path / "sweep" / str(seed), ["env=walker2d", f"seed={seed}", "algo.discount=0.5"], [0, 1])
     fake_run(tmp_path / "other", ["env=walker2d", "algo=a2c"], [5])
     fake_run(tmp_path / "engine", ["env=walker2d", "algo=a2c", "physics=jax"], [5])
-    groups = comparison.group(comparison.read_runs(tmp_path))
+    groups = report.group(report.read_runs(tmp_path))
     assert {label: len(runs) for label, runs in groups.items()} == {
         "a2c, physics=auto": 1,
         "a2c, physics=jax": 1,
         "ppo, discount=0.99": 2,
         "ppo, discount=0.5": 2,
     }
-    text = comparison.write_report(tmp_path).read_text()
+    text = report.write_report(tmp_path).read_text()
     assert "| ppo, discount=0.99 | 2 | 15 | 7 | – | 10 | 3.00 | 30 |" in text
     assert "| ppo, discount=0.5 | 0 of 2 scored | – | – | – | – | 2.00 | 20 |" in text
     rows = list(csv.DictReader((tmp_path / "comparison.csv").open()))
@@ -102,7 +103,7 @@ def test_scores_that_cannot_be_read_cost_the_comparison_nothing_else(tmp_path):
         fake_run(tmp_path / str(seed), ["env=walker2d", f"seed={seed}"], [1, 2], score=5.0)
     (tmp_path / "0" / "eval_gymnasium.json").write_text('{"mean": 5')
     with pytest.warns(UserWarning, match=r"eval_gymnasium\.json cannot be read: score the run again"):
-        runs = comparison.read_runs(tmp_path)
+        runs = report.read_runs(tmp_path)
     assert [run.scores and run.scores["mean"] for run in runs] == [None, 5.0]
 
 
@@ -110,23 +111,23 @@ def test_runs_of_different_environments_do_not_mix(tmp_path):
     fake_run(tmp_path / "a", ["env=walker2d"], [1])
     fake_run(tmp_path / "b", ["env=humanoid"], [1])
     with pytest.raises(UserError, match="humanoid v5, walker2d v5"):
-        comparison.read_runs(tmp_path)
+        report.read_runs(tmp_path)
 
 
 def test_mean_curve_is_drawn_where_all_seeds_are():
-    x, mean, values = comparison.mean_curve(
+    x, mean, values = report.mean_curve(
         [(np.array([0.0, 4.0]), np.array([0.0, 8.0])), (np.array([2.0, 6.0]), np.array([1.0, 1.0]))]
     )
     assert (x[0], x[-1]) == (2.0, 4.0) and values.shape == (2, len(x))
     np.testing.assert_allclose(mean, (2.0 * x + 1.0) / 2.0)
-    apart = comparison.mean_curve([(np.array([0.0, 1.0]), np.ones(2)), (np.array([2.0, 3.0]), np.ones(2))])
+    apart = report.mean_curve([(np.array([0.0, 1.0]), np.ones(2)), (np.array([2.0, 3.0]), np.ones(2))])
     assert apart[0].size == 0
 
 
 def test_intervals_from_five_seeds_up():
-    assert comparison.interval(np.arange(4.0)) is None
+    assert report.interval(np.arange(4.0)) is None
     values = np.random.default_rng(0).normal(10.0, 2.0, (40, 3))
-    low, high = comparison.interval(values)
+    low, high = report.interval(values)
     # Near the interval of a normal mean: ± 1.96 · 2 / √40 = ± 0.62.
     assert low.shape == (3,)
     np.testing.assert_allclose(values.mean(0) - low, 0.62, atol=0.15)
@@ -193,7 +194,7 @@ BAD = [
 @pytest.mark.parametrize(("arguments", "says"), BAD, ids=[" ".join(case[0]) for case in BAD])
 def test_compare_names_the_mistake(arguments, says, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cells, "count_devices", lambda: ("cpu", 1))
+    monkeypatch.setattr(compare_command, "count_devices", lambda: ("cpu", 1))
     with pytest.raises(UserError) as error:
         compare_command.main(arguments)
     assert says in str(error.value) and "\n" not in str(error.value)
@@ -202,7 +203,7 @@ def test_compare_names_the_mistake(arguments, says, tmp_path, monkeypatch):
 
 def test_a_folder_with_other_settings_is_left_alone(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cells, "count_devices", lambda: ("cpu", 1))
+    monkeypatch.setattr(compare_command, "count_devices", lambda: ("cpu", 1))
     fake_run(tmp_path / "out" / "ppo" / "seed_0", ["env=walker2d", "num_envs=128"], [1])
     for change, named in (
         ("num_envs=256", "num_envs"),
@@ -215,15 +216,15 @@ def test_a_folder_with_other_settings_is_left_alone(tmp_path, monkeypatch):
 
 def test_seeds_that_stand_at_the_same_step_are_trained_together(tmp_path):
     """Of three seeds one has a checkpoint; first ones of all variants come first."""
-    _, planned = cells.plan(["env=walker2d"], ["ppo", "a2c"], [0, 1, 2], str(tmp_path), "cpu")
+    _, planned = planned_runs.plan(["env=walker2d"], ["ppo", "a2c"], [0, 1, 2], str(tmp_path), "cpu")
     (tmp_path / "ppo" / "seed_1" / "checkpoints" / "4096").mkdir(parents=True)
 
     def names(together):
-        return [[cell.name for cell in job] for job in cells.jobs(planned, together)]
+        return [[cell.name for cell in job] for job in planned_runs.jobs(planned, together)]
 
     assert names(3) == [["ppo/seed_0", "ppo/seed_2"], ["a2c/seed_0", "a2c/seed_1", "a2c/seed_2"], ["ppo/seed_1"]]
     assert names(2)[1:] == [["a2c/seed_0", "a2c/seed_1"], ["ppo/seed_1"], ["a2c/seed_2"]]
-    assert [cells.most_together(planned, slots) for slots in (1, 3, 4, 8)] == [3, 3, 2, 1]
+    assert [planned_runs.most_together(planned, slots) for slots in (1, 3, 4, 8)] == [3, 3, 2, 1]
     assert names(1)[:3] == [["ppo/seed_0"], ["a2c/seed_0"], ["ppo/seed_1"]]
 
 
@@ -245,18 +246,18 @@ class FakeProcess:
 
 def test_no_run_goes_on_alone(tmp_path, monkeypatch):
     """One of two runs ends, and what is to be done then fails."""
-    _, planned = cells.plan(["env=walker2d"], ["ppo"], [0, 1], str(tmp_path), "cpu")
+    _, planned = planned_runs.plan(["env=walker2d"], ["ppo"], [0, 1], str(tmp_path), "cpu")
     processes = [FakeProcess(code=0), FakeProcess()]
-    monkeypatch.setattr(cells, "start", lambda job, *_: processes[job[0].config.seed])
+    monkeypatch.setattr(planned_runs, "start", lambda job, *_: processes[job[0].config.seed])
     with pytest.raises(ZeroDivisionError):
-        cells.run(cells.jobs(planned, 1), [0, 1], tmp_path / "logs", lambda cell, log: 1 // 0)
+        planned_runs.run(planned_runs.jobs(planned, 1), [0, 1], tmp_path / "logs", lambda cell, log: 1 // 0)
     assert processes[1].signals == [signal.SIGTERM]
 
 
 def test_a_second_comparison_in_the_same_folder_waits_its_turn(tmp_path):
-    with cells._only_one_at_a_time(tmp_path / "out" / "logs"), pytest.raises(UserError, match="still going on"):
-        cells.run([], [None], tmp_path / "out" / "logs", lambda cell, log: None)
-    assert cells.run([], [None], tmp_path / "out" / "logs", lambda cell, log: None) is None
+    with planned_runs._only_one_at_a_time(tmp_path / "out" / "logs"), pytest.raises(UserError, match="still going on"):
+        planned_runs.run([], [None], tmp_path / "out" / "logs", lambda cell, log: None)
+    assert planned_runs.run([], [None], tmp_path / "out" / "logs", lambda cell, log: None) is None
 
 
 def test_a_run_that_fails_is_named(tmp_path, monkeypatch, capfd):
@@ -283,8 +284,8 @@ def test_each_run_sees_its_own_gpu(tmp_path, monkeypatch, visible, expected):
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     started = []
     monkeypatch.setattr(subprocess, "Popen", lambda arguments, **kwargs: started.append((arguments, kwargs["env"])))
-    _, (cell,) = cells.plan(["env=walker2d"], ["ppo"], [3], str(tmp_path), "gpu")
-    cells.start([cell], tmp_path / "logs" / "cell.txt", 1, 2, 0)
+    _, (cell,) = planned_runs.plan(["env=walker2d"], ["ppo"], [3], str(tmp_path), "gpu")
+    planned_runs.start([cell], tmp_path / "logs" / "cell.txt", 1, 2, 0)
     ((arguments, environment),) = started
     assert environment["CUDA_VISIBLE_DEVICES"] == expected
     assert float(environment["XLA_PYTHON_CLIENT_MEM_FRACTION"]) <= 0.75 / 2 + 0.01

@@ -6,8 +6,8 @@ import pytest
 
 from mjx_walk.algos import ALGORITHMS, make_algorithm
 from mjx_walk.api import make_task
-from mjx_walk.config import CONFIG_DIR, flatten, load_config, read_config, save_config
 from mjx_walk.envs import TASKS
+from mjx_walk.runs.config import CONFIG_DIR, flatten, load_config, read_config, save_config
 
 RECIPES = sorted(
     str(path.relative_to(f"{CONFIG_DIR}/recipe"))[:-5] for path in Path(CONFIG_DIR).glob("recipe/?pu/[!_]*.yaml")

@@ -7,10 +7,10 @@ import pytest
 import toy_tasks
 
 from mjx_walk.algos.csac import CSACConfig, make_csac, make_csac_learner, make_csac_networks, project
-from mjx_walk.errors import UserError
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.off_policy import Batch
-from mjx_walk.types import Transition
+from mjx_walk.algos.off_policy import Batch
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.types import Transition
 
 CONFIG = CSACConfig(policy_hidden_layer_sizes=(16,), critic_hidden_layer_sizes=(16,), num_atoms=21, return_bound=2.0)
 

@@ -16,10 +16,10 @@ import mjx_walk
 from mjx_walk import zoo
 from mjx_walk.algos import make_algorithm
 from mjx_walk.api import make_task
-from mjx_walk.config import load_config
-from mjx_walk.errors import UserError
-from mjx_walk.onnx_graph import translate
-from mjx_walk.policies import deterministic_act
+from mjx_walk.interop.onnx import translate
+from mjx_walk.runs.config import load_config
+from mjx_walk.runs.policies import deterministic_act
+from mjx_walk.utils.errors import UserError
 
 
 def assert_equal(model, act, observations):

@@ -9,7 +9,8 @@ from commands import TINY, TINY_CHUNK, command
 from tensorboardX.proto.event_pb2 import Event
 from test_play import renders
 
-from mjx_walk import api, rendering
+from mjx_walk import api
+from mjx_walk.viewing import rendering
 
 
 def films_in_tensorboard(run_dir):

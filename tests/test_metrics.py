@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from mjx_walk.metrics import MetricsWriter, read_rows
+from mjx_walk.runs.loggers import MetricsWriter
+from mjx_walk.runs.metrics import read_rows
 
 
 def test_a_last_line_that_was_cut_off_is_left_out(tmp_path, recwarn):

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_walk import networks
 from mjx_walk.algos.a2c import A2CConfig
 from mjx_walk.algos.ppo import PPOConfig
 from mjx_walk.algos.sac import SACConfig
-from mjx_walk.config import load_config
+from mjx_walk.common import networks
 from mjx_walk.envs import make_env
+from mjx_walk.runs.config import load_config
 
 KEY = jax.random.PRNGKey(0)
 

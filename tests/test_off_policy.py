@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from toy_tasks import EndlessReward, ToyTask
 
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.off_policy import Learner, OffPolicyConfig, make_off_policy
+from mjx_walk.algos.off_policy import Learner, OffPolicyConfig, make_off_policy
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
 
 NUM_ENVS = 4
 

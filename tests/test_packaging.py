@@ -16,7 +16,7 @@ CLONE = Path(__file__).parent.parent
 USE = """
 import mjx_walk, sys
 assert "jax" not in sys.modules, "import mjx_walk should be light"
-from mjx_walk.config import load_config
+from mjx_walk.runs.config import load_config
 from mjx_walk.envs import TASKS
 assert load_config(["env=walker2d"]).num_envs == 64
 env = mjx_walk.make_env("walker2d", physics="c")
@@ -128,11 +128,11 @@ def test_the_c_engine_does_not_wait_for_mjx():
 
 
 def test_mjx_is_not_searched_for_garbage():
-    code = "import gc; from mjx_walk import mjx_import; print(gc.isenabled(), gc.get_freeze_count() > 100_000)"
+    code = "import gc; from mjx_walk import quiet_mjx; print(gc.isenabled(), gc.get_freeze_count() > 100_000)"
     assert printed(code) == "True True\n"
 
 
 def test_tensorboard_does_not_wait_for_pytorch(tmp_path):
     (tmp_path / "torch.py").write_text("print('PyTorch')\nclass Tensor: ...")
-    code = "import mjx_walk.tensorboard; print('TensorBoard'); import torch"
+    code = "import mjx_walk.runs.tensorboard; print('TensorBoard'); import torch"
     assert printed(code, tmp_path) == "TensorBoard\nPyTorch\n"

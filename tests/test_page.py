@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import mjx_walk
-from mjx_walk import page
-from mjx_walk.episode import Episode, record_episode
-from mjx_walk.errors import UserError
+from mjx_walk.utils.errors import UserError
+from mjx_walk.viewing import page
+from mjx_walk.viewing.episode import Episode, record_episode
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 

@@ -10,9 +10,9 @@ import pytest
 from commands import ENVIRONMENT, command, command_here
 
 import mjx_walk
-from mjx_walk import rendering
-from mjx_walk.episode import record_episode
-from mjx_walk.errors import UserError
+from mjx_walk.utils.errors import UserError
+from mjx_walk.viewing import rendering
+from mjx_walk.viewing.episode import record_episode
 
 
 def can_render():

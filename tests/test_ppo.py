@@ -13,12 +13,12 @@ from brax.training.agents.ppo import train as brax_ppo
 from brax.training.agents.ppo.losses import PPONetworkParams
 from toy_tasks import ConstantReward, EndlessReward
 
-from mjx_walk import networks, returns
+from mjx_walk.algos.on_policy import OnPolicyConfig, _make_optimizer
 from mjx_walk.algos.ppo import PPOConfig, make_ppo
+from mjx_walk.common import networks, returns
 from mjx_walk.envs import make_env
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.on_policy import OnPolicyConfig, _make_optimizer
-from mjx_walk.peers import restore_device_put_replicated
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.experiments.peers import restore_device_put_replicated
 
 SMALL = PPOConfig(
     unroll_length=8,

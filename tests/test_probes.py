@@ -10,11 +10,11 @@ import pytest
 import toy_tasks
 from brax.training.acme import running_statistics
 
-from mjx_walk import networks
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.algos.csac import make_csac_networks
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.loop import make_chunk, make_init
+from mjx_walk.common import networks
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.training.trainer import make_chunk, make_init
 
 # A chunk that is vmapped cannot reuse its input's memory.
 pytestmark = pytest.mark.filterwarnings("ignore:Some donated buffers")

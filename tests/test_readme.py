@@ -10,8 +10,8 @@ from commands import TINY, command
 
 import mjx_walk
 from mjx_walk import zoo
-from mjx_walk.config import load_config
 from mjx_walk.envs import make_env
+from mjx_walk.runs.config import load_config
 
 CLONE = Path(__file__).parent.parent
 README = (CLONE / "README.md").read_text()

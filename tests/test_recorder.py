@@ -7,11 +7,11 @@ import pytest
 
 from mjx_walk.algos import make_algorithm
 from mjx_walk.api import make_task
-from mjx_walk.config import load_config
-from mjx_walk.evaluation import Scores
-from mjx_walk.policies import load_best_policy
-from mjx_walk.recorder import Recorder
-from mjx_walk.run_folder import RunFolder
+from mjx_walk.evaluation.gymnasium_scores import Scores
+from mjx_walk.runs.config import load_config
+from mjx_walk.runs.policies import load_best_policy
+from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.training.recorder import Recorder
 
 TINY = [
     *("env=walker2d", "algo=ppo", "hardware=cpu", "physics=c", "num_envs=2", "evaluation.num_envs=1"),

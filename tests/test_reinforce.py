@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from toy_tasks import DelayedReward, EndlessReward
 
-from mjx_walk import networks
 from mjx_walk.algos.reinforce import REINFORCEConfig, linear_fit, make_reinforce
-from mjx_walk.live_evaluation import EvaluationConfig
+from mjx_walk.common import networks
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
 
 NUM_ENVS, STEPS, LEARNED = 16, 6, 4
 # What follows the piece counts 0.5³ at the fourth step and 0.5² at the fifth.

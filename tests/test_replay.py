@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import toy_tasks
 
-from mjx_walk.replay import ReplayBuffer, Steps
-from mjx_walk.returns import n_step_return
+from mjx_walk.common.replay_buffer import ReplayBuffer, Steps
+from mjx_walk.common.returns import n_step_return
 
 
 def test_n_step_return_by_hand():

@@ -16,9 +16,9 @@ import pytest
 from commands import TINY, TINY_CHUNK, TINY_OFF_POLICY, command, command_here
 from test_checkpoint import flip_a_byte
 
-from mjx_walk import checkpoint
 from mjx_walk.api import resolve
-from mjx_walk.child_process import start_module
+from mjx_walk.runs import checkpoint
+from mjx_walk.utils.subprocesses import start_module
 
 
 def leaves(run_dir, chunk):
@@ -206,7 +206,7 @@ def sigterm(*_):
 
 @pytest.mark.parametrize(("end", "code", "shown"), [(ctrl_c, 130, "Ctrl-C"), (sigterm, 143, "SIGTERM")])
 def test_a_signal_while_a_policy_is_scored_says_how_to_score_it(tmp_path, monkeypatch, capsys, end, code, shown):
-    monkeypatch.setattr("mjx_walk.recorder.score_in_gymnasium", end)
+    monkeypatch.setattr("mjx_walk.training.recorder.score_in_gymnasium", end)
     whole = (*TINY, "evaluation.gymnasium_episodes=2", f"total_steps={TINY_CHUNK}", f"run_dir={tmp_path / 'run'}")
     assert command_here("train", *whole) == code
     said = capsys.readouterr()

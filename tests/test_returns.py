@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from brax.training.agents.ppo.losses import compute_gae
 
-from mjx_walk.returns import (
+from mjx_walk.common.returns import (
     bootstrap_truncated,
     init_return_scale,
     returns_to_go,

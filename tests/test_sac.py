@@ -11,13 +11,13 @@ from brax.training.agents.sac import train as brax_sac
 from test_ppo import Sizes
 from toy_tasks import ToyTask
 
+from mjx_walk.algos.off_policy import Batch
 from mjx_walk.algos.sac import SACConfig, make_sac, make_sac_learner
+from mjx_walk.common.replay_buffer import ReplayBuffer
 from mjx_walk.envs import make_env
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.off_policy import Batch
-from mjx_walk.peers import restore_device_put_replicated
-from mjx_walk.replay import ReplayBuffer
-from mjx_walk.types import Transition
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.experiments.peers import restore_device_put_replicated
+from mjx_walk.utils.types import Transition
 
 NUM_ENVS, BATCH, UPDATES = 16, 32, 5
 

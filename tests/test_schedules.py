@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import pytest
 
-from mjx_walk.schedules import anneal, anneal_discount, factor
+from mjx_walk.common.schedules import anneal, anneal_discount, factor
 
 
 def test_a_schedule_ends_at_its_horizon():

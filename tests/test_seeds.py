@@ -8,8 +8,8 @@ from commands import TINY, TINY_CHUNK, TINY_OFF_POLICY
 from test_resume import leaves, train, train_here
 
 from mjx_walk import train as train_command
-from mjx_walk.config import load_config, save_config
-from mjx_walk.errors import UserError
+from mjx_walk.runs.config import load_config, save_config
+from mjx_walk.utils.errors import UserError
 
 SEEDS = "seeds=[3,5]"
 

@@ -8,9 +8,9 @@ import pytest
 from toy_tasks import ToyTask
 
 from mjx_walk.algos.ddpg import DDPGConfig
+from mjx_walk.algos.off_policy import Batch
 from mjx_walk.algos.td3 import TD3Config, make_deterministic_learner
-from mjx_walk.off_policy import Batch
-from mjx_walk.types import Transition
+from mjx_walk.utils.types import Transition
 
 LINEAR = {
     "policy_hidden_layer_sizes": (),

@@ -13,16 +13,17 @@ import pytest
 from commands import ENVIRONMENT, TINY, TINY_CHUNK, TINY_OFF_POLICY, command
 from toy_tasks import ObservedReward
 
-from mjx_walk import checkpoint, networks, returns
+from mjx_walk.algos.off_policy import OffPolicyConfig
 from mjx_walk.algos.ppo import PPOConfig, make_ppo
-from mjx_walk.collectives import AXIS
-from mjx_walk.errors import UserError
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.loop import make_init
-from mjx_walk.metrics import read_rows
-from mjx_walk.off_policy import OffPolicyConfig
-from mjx_walk.team import OWN, in_place, per_device
-from mjx_walk.team_checkpoint import restore_newest
+from mjx_walk.common import networks, returns
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.runs import checkpoint
+from mjx_walk.runs.metrics import read_rows
+from mjx_walk.training.distributed import OWN, in_place, per_device
+from mjx_walk.training.distributed_checkpoint import restore_newest
+from mjx_walk.training.trainer import make_init
+from mjx_walk.utils.collectives import AXIS
+from mjx_walk.utils.errors import UserError
 
 KEY = jax.random.PRNGKey(0)
 CHUNK = 2 * TINY_CHUNK

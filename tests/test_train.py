@@ -13,14 +13,14 @@ from commands import TINY, TINY_CHUNK, command_here
 from tensorboardX.proto.event_pb2 import Event
 
 import mjx_walk
-from mjx_walk import loop
 from mjx_walk import train as train_command
 from mjx_walk.algos import make_algorithm
 from mjx_walk.api import make_task
-from mjx_walk.config import load_config
 from mjx_walk.envs import make_env
-from mjx_walk.errors import UserError
-from mjx_walk.loop import make_chunk, make_init
+from mjx_walk.runs.config import load_config
+from mjx_walk.training import trainer
+from mjx_walk.training.trainer import make_chunk, make_init
+from mjx_walk.utils.errors import UserError
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_a_loaded_policy_scores_alike_in_its_engine_and_in_gymnasium(finished):
 def test_many_episodes_are_played_in_rounds(finished, monkeypatch):
     run, _ = finished
     at_once = run.evaluate(5, seed=3)
-    monkeypatch.setattr("mjx_walk.evaluation._MOST_SIDE_BY_SIDE", 2)
+    monkeypatch.setattr("mjx_walk.evaluation.gymnasium_scores._MOST_SIDE_BY_SIDE", 2)
     in_rounds = run.evaluate(5, seed=3)
     assert in_rounds.seeds == at_once.seeds == [3, 4, 5, 6, 7]
     assert in_rounds.returns == pytest.approx(at_once.returns, rel=1e-6)
@@ -162,7 +162,7 @@ def test_a_sweep_puts_each_job_in_its_own_folder(tmp_path, monkeypatch, capsys):
 
 def test_a_signal_ends_a_sweep(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(loop.Trainer, "_stop_signal", lambda self, interrupt: "SIGTERM")
+    monkeypatch.setattr(trainer.Trainer, "_stop_signal", lambda self, interrupt: "SIGTERM")
     assert command_here("train", "-m", "seed=0,1", *TINY, f"total_steps={TINY_CHUNK}") == 143
     assert len(list(tmp_path.glob("runs/sweeps/*/*/config.yaml"))) == 1
     assert capsys.readouterr().err.splitlines()[-1] == "Stopped by SIGTERM."
@@ -199,7 +199,7 @@ def test_a_chunk_is_told_before_the_next_begins(tmp_path, monkeypatch):
 
         return begin
 
-    monkeypatch.setattr(loop, "make_chunk", counted)
+    monkeypatch.setattr(trainer, "make_chunk", counted)
     overrides = [*TINY, f"run_dir={tmp_path / 'run'}", f"total_steps={3 * TINY_CHUNK}"]
     mjx_walk.run(overrides, on_metrics=lambda row: events.append("is told"))
     assert events == 3 * ["begins", "is told"]
@@ -240,7 +240,7 @@ def test_of_seeds_side_by_side_those_that_are_sound_are_saved(tmp_path, monkeypa
 
         return break_second
 
-    monkeypatch.setattr(loop, "make_init", broken)
+    monkeypatch.setattr(trainer, "make_init", broken)
     with pytest.raises(UserError, match="the policy of seed 5 is not finite"):
         train_command.main([*TINY, f"run_dir={tmp_path}", "seeds=[3,5]", f"total_steps={50 * TINY_CHUNK}"])
     assert len(list((tmp_path / "seed_3" / "checkpoints").glob("0*"))) == 1

@@ -9,8 +9,8 @@ from commands import TINY, TINY_CHUNK, command
 from wandb.proto.wandb_internal_pb2 import Record
 
 import mjx_walk.api
-from mjx_walk.config import load_config, save_config
-from mjx_walk.errors import UserError
+from mjx_walk.runs.config import load_config, save_config
+from mjx_walk.utils.errors import UserError
 
 
 def records(data):

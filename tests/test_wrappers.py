@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mjx_walk.envs import make_env
-from mjx_walk.live_evaluation import EvaluationConfig, LiveEvaluator
-from mjx_walk.wrappers import VectorEnv
+from mjx_walk.envs.inline_evaluation import EvaluationConfig, LiveEvaluator
+from mjx_walk.envs.vector_env import VectorEnv
 
 
 def still(task):

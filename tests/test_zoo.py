@@ -8,8 +8,8 @@ from commands import command, command_here
 
 import mjx_walk
 from mjx_walk import zoo
-from mjx_walk.config import flatten, load_config, read_config, training_command
-from mjx_walk.run_folder import open_existing
+from mjx_walk.runs.config import flatten, load_config, read_config, training_command
+from mjx_walk.runs.run_folder import open_existing
 
 NAMES = zoo.names()
 

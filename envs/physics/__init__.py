@@ -6,7 +6,7 @@ import jax
 import mujoco
 
 from mjx_walk.envs.physics.base import Derived, Engine, PhysicsState
-from mjx_walk.errors import UserError
+from mjx_walk.utils.errors import UserError
 
 ENGINES = ("warp", "jax", "c")
 
@@ -53,7 +53,7 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
         from mjx_walk.envs.physics.mujoco_c import CEngine
 
         return CEngine(model, num_substeps, derived)
-    from mjx_walk import mjx_import  # noqa: F401
+    from mjx_walk.utils import quiet_mjx  # noqa: F401
 
     if name == "warp":
         from mjx_walk.envs.physics.mjx_warp import WarpEngine

@@ -12,8 +12,6 @@ from mjx_walk.envs.physics import capsule_frames_jax
 from mjx_walk.envs.physics.base import Derived, PhysicsState
 from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
 
-capsule_frames_jax.install()
-
 _RK4_STEP = (0.0, 0.5, 0.5, 1.0)
 _RK4_WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 
@@ -27,6 +25,7 @@ class JaxEngine:
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
         if model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
             raise ValueError("the jax engine integrates with RK4 only; set integrator='RK4' in the model")
+        capsule_frames_jax.install()
         model = with_newton_solver(model)
         self._model = mjx.put_model(model, impl="jax")
         self._blank = mjx.make_data(model, impl="jax")

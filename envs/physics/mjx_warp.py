@@ -13,8 +13,6 @@ from mjx_walk.envs.physics import capsule_frames_warp
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
 
-capsule_frames_warp.install()
-
 CONTACTS_PER_COPY = 40
 """Room for geom pairs that may touch, and then for contacts, of a copy on average; the batch shares both buffers.
 
@@ -35,6 +33,7 @@ class WarpEngine:
     calls_host = False
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
+        capsule_frames_warp.install()
         # Without a GPU, Warp would warn that it has found none.
         wp.config.log_level = wp.LOG_ERROR if jax.default_backend() == "cpu" else wp.LOG_WARNING
         self._mj_model = with_newton_solver(model)

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from mjx_walk import mjx_import  # noqa: F401
 from mjx_walk.algos.a2c import A2CConfig, make_a2c
 from mjx_walk.algos.csac import CSACConfig, make_csac
 from mjx_walk.algos.ddpg import DDPGConfig, make_ddpg
@@ -11,8 +10,9 @@ from mjx_walk.algos.reinforce import REINFORCEConfig, make_reinforce
 from mjx_walk.algos.sac import SACConfig, make_sac
 from mjx_walk.algos.td3 import TD3Config, make_td3
 from mjx_walk.envs import Task
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.types import Algorithm
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.utils import quiet_mjx  # noqa: F401
+from mjx_walk.utils.types import Algorithm
 
 ALGORITHMS: dict[str, tuple[Any, type]] = {
     "ppo": (make_ppo, PPOConfig),

@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 from brax.training.agents.sac.networks import SACNetworks
 
-from mjx_walk import networks
+from mjx_walk.algos.off_policy import Learner, make_off_policy
 from mjx_walk.algos.sac import SACConfig, make_sac_learner
+from mjx_walk.common import networks
 from mjx_walk.envs import Task
-from mjx_walk.errors import UserError
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.off_policy import Learner, make_off_policy
-from mjx_walk.settings import setting
-from mjx_walk.types import Algorithm, Transition
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import setting
+from mjx_walk.utils.types import Algorithm, Transition
 
 Distributions = Callable[[Any, jax.Array, jax.Array], jax.Array]
 """`(critic params, obs, action) → log-probabilities of the atoms`, `[…, 2, num_atoms]`."""

@@ -2,12 +2,12 @@
 
 import dataclasses
 
+from mjx_walk.algos.off_policy import make_off_policy
 from mjx_walk.algos.td3 import DeterministicConfig, make_deterministic_learner
 from mjx_walk.envs import Task
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.off_policy import make_off_policy
-from mjx_walk.settings import setting
-from mjx_walk.types import Algorithm
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.utils.settings import setting
+from mjx_walk.utils.types import Algorithm
 
 
 @dataclasses.dataclass

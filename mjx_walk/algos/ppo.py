@@ -8,21 +8,21 @@ import jax.numpy as jnp
 import optax
 from brax.training.agents.ppo import losses as ppo_losses
 
-from mjx_walk import networks
-from mjx_walk.envs import Task
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy
-from mjx_walk.on_policy_update import (
+from mjx_walk.algos.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy
+from mjx_walk.algos.on_policy_update import (
     after_update,
     learning_rates,
     make_algorithm,
     require_several_gradient_steps,
     require_whole_minibatches,
 )
-from mjx_walk.optimizers import descend
-from mjx_walk.schedules import factor
-from mjx_walk.settings import setting
-from mjx_walk.types import Algorithm, Metrics
+from mjx_walk.common import networks
+from mjx_walk.common.optimizers import descend
+from mjx_walk.common.schedules import factor
+from mjx_walk.envs import Task
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.utils.settings import setting
+from mjx_walk.utils.types import Algorithm, Metrics
 
 
 @dataclasses.dataclass

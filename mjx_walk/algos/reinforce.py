@@ -6,15 +6,15 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from mjx_walk import returns
+from mjx_walk.algos.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
+from mjx_walk.algos.on_policy_update import make_algorithm
+from mjx_walk.algos.policy_gradient import PolicyGradientConfig, Samples, check_minibatches, learn_once, normalize
+from mjx_walk.common import returns
 from mjx_walk.envs import Task
-from mjx_walk.errors import UserError
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
-from mjx_walk.on_policy_update import make_algorithm
-from mjx_walk.policy_gradient import PolicyGradientConfig, Samples, check_minibatches, learn_once, normalize
-from mjx_walk.settings import setting
-from mjx_walk.types import Algorithm, Metrics
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import setting
+from mjx_walk.utils.types import Algorithm, Metrics
 
 
 @dataclasses.dataclass

@@ -12,13 +12,13 @@ from brax.training import types as brax_types
 from brax.training.agents.sac import losses as sac_losses
 from brax.training.agents.sac.networks import SACNetworks
 
-from mjx_walk import networks
+from mjx_walk.algos.off_policy import Batch, Learner, OffPolicyConfig, make_off_policy
+from mjx_walk.common import networks
+from mjx_walk.common.optimizers import descend, make_adam, move_towards
 from mjx_walk.envs import Task
-from mjx_walk.live_evaluation import EvaluationConfig
-from mjx_walk.off_policy import Batch, Learner, OffPolicyConfig, make_off_policy
-from mjx_walk.optimizers import descend, make_adam, move_towards
-from mjx_walk.settings import setting
-from mjx_walk.types import Algorithm, Metrics
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.utils.settings import setting
+from mjx_walk.utils.types import Algorithm, Metrics
 
 MakeCriticLoss = Callable[[jax.Array], Callable[..., jax.Array]]
 

@@ -8,7 +8,8 @@ import json
 import shutil
 from pathlib import Path
 
-from mjx_walk.errors import UserError
+from mjx_walk.runs.run_folder import RunFolder, open_existing
+from mjx_walk.utils.errors import UserError
 
 PREFIX = "zoo:"
 
@@ -30,6 +31,20 @@ def find(run: str) -> Path:
     if name not in names():
         raise UserError(f"no policy '{name}' in the zoo; choose one of: {', '.join(names())}")
     return _FOLDER / name
+
+
+def open_run(run: str | Path | None) -> RunFolder:
+    """The folder of a run, or of `zoo:NAME`.
+
+    Raises:
+        UserError: none is given, or there is no run at that path.
+    """
+    return open_existing(find(run) if isinstance(run, str) and run.startswith(PREFIX) else run)
+
+
+def output_path(folder: RunFolder, name: str) -> Path:
+    """Where a file made from a policy goes: into its run folder; for the zoo here, under the policy's name."""
+    return Path(f"{folder.path.name}{Path(name).suffix}") if holds(folder.path) else folder.path / name
 
 
 def holds(folder: Path) -> bool:

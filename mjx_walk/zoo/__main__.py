@@ -6,11 +6,13 @@ from typing import Any
 
 import jax
 
-from mjx_walk import checkpoint, cli, run_folder, zoo
+from mjx_walk import zoo
 from mjx_walk.api import load_run
-from mjx_walk.config import save_config, training_command
-from mjx_walk.errors import UserError
-from mjx_walk.run_folder import RunFolder
+from mjx_walk.runs import checkpoint
+from mjx_walk.runs.config import save_config, training_command
+from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.utils import cli
+from mjx_walk.utils.errors import UserError
 
 USAGE = """
 usage: python -m mjx_walk.zoo                          list the policies
@@ -34,7 +36,7 @@ def main(arguments: list[str]) -> None:
         raise UserError("say under which name: name=humanoid-ppo")
     if not re.fullmatch(r"[\w-]+", parsed.name):
         raise UserError(f"name={parsed.name}: letters, digits, '_' and '-' make a name")
-    source = run_folder.open_existing(parsed.add)
+    source = zoo.open_run(parsed.add)
     run = load_run(source.path, "auto")
     run.policy_params = _rounded_to(run.config.algo.network_dtype, run.policy_params)
     scores = run.evaluate()

@@ -10,7 +10,7 @@ import pytest
 from mjx_walk import api
 from mjx_walk.envs import make_env
 from mjx_walk.envs.rewards import Shaping
-from mjx_walk.errors import UserError
+from mjx_walk.utils.errors import UserError
 
 OWN_REWARD = """
 import jax.numpy as jnp

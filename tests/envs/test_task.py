@@ -10,7 +10,7 @@ import pytest
 
 from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.physics import base
-from mjx_walk.errors import UserError
+from mjx_walk.utils.errors import UserError
 
 
 def test_vmap_equals_one_by_one():

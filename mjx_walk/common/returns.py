@@ -1,0 +1,124 @@
+"""Discounted sums: pure maths on `[T, B]` arrays."""
+
+import flax
+import jax
+import jax.numpy as jnp
+
+from mjx_walk.utils import collectives
+
+
+def bootstrap_truncated(
+    reward: jax.Array, truncated: jax.Array, next_value: jax.Array, discount: float, reward_scale: jax.Array | float
+) -> jax.Array:
+    """Fold the value lost at a time limit into the reward of the step that met it.
+
+    After this a truncated step can be handled like a terminated one: the future it was cut off from is already paid.
+
+    Args:
+        reward: unscaled.
+        truncated: bool, true only where the episode did not also terminate.
+        next_value: value of the true next observation, on the scale of the scaled rewards.
+        discount: γ.
+        reward_scale: what the learner will multiply rewards by.
+
+    Returns:
+        Unscaled rewards: `r + γ V(s') / scale` where truncated, `r` elsewhere.
+    """
+    return reward + jnp.where(truncated, discount * next_value / reward_scale, 0.0)
+
+
+def n_step_return(reward: jax.Array, ended: jax.Array, discount: jax.Array | float) -> tuple[jax.Array, jax.Array]:
+    """Discounted rewards up to the end of the episode, or over all n steps.
+
+    Args:
+        reward: `[n, N]`.
+        ended: `[n, N] bool`, whether the episode ended at a step, in whichever way.
+        discount: γ.
+
+    Returns:
+        `Σ γ^i r_i` over the steps that count, `[N] f32`, and their number, `[N] i32`, from 1 to n.
+    """
+    steps = jnp.arange(reward.shape[0])[:, None]
+    still_on = jnp.cumsum(ended, axis=0) - ended == 0
+    return (still_on * discount**steps * reward).sum(axis=0), still_on.sum(axis=0, dtype=jnp.int32)
+
+
+def returns_to_go(
+    reward: jax.Array, terminated: jax.Array, truncated: jax.Array, discount: float
+) -> tuple[jax.Array, jax.Array]:
+    """Discounted rewards from each step to its episode's end, as far as they were seen.
+
+    Args:
+        reward: `[T, N]`.
+        terminated: `[T, N] bool`.
+        truncated: `[T, N] bool`; the episode was cut off after this step.
+        discount: γ.
+
+    Returns:
+        The sums, `[T, N] f32`; and the factor at which the future that was not seen would enter, `[T, N] f32`: 0 where
+        the episode terminated, else γ to the number of steps to the cut or to the last of the T.
+    """
+
+    def back(carry, step):
+        later, unseen = carry
+        reward, terminated, truncated = step
+        is_end = terminated | truncated
+        later = reward + discount * jnp.where(is_end, 0.0, later)
+        unseen = discount * jnp.where(terminated, 0.0, jnp.where(truncated, 1.0, unseen))
+        return (later, unseen), (later, unseen)
+
+    none = jnp.zeros(reward.shape[1:], jnp.float32)
+    _, sums = jax.lax.scan(back, (none, none + 1.0), (reward, terminated, truncated), reverse=True)
+    return sums
+
+
+class ReturnScale(flax.struct.PyTreeNode):
+    """Running variance and bound of the discounted return, by which rewards may be normalised.
+
+    Source: `VecNormalize` of Stable-Baselines3 (`r / std(G)`, with `G ← γ G + r` running through each copy).
+    """
+
+    running_return: jax.Array
+    """`[B] f32`."""
+    count: jax.Array
+    mean: jax.Array
+    variance: jax.Array
+    largest: jax.Array
+    """The largest `|G|` so far."""
+
+
+def init_return_scale(num_envs: int) -> ReturnScale:
+    """Unit scale, nothing seen yet."""
+    return ReturnScale(jnp.zeros(num_envs), jnp.float32(1e-4), jnp.float32(0.0), jnp.float32(1.0), jnp.float32(0.0))
+
+
+def update_return_scale(
+    scale: ReturnScale, reward: jax.Array, done: jax.Array, discount: jax.Array | float
+) -> ReturnScale:
+    """Take a chronological `[T, B]` block of rewards, on each device its own, into the running variance."""
+
+    def advance(running, inputs):
+        reward, done = inputs
+        running = discount * running + reward
+        return jnp.where(done, 0.0, running), running
+
+    running, returns = jax.lax.scan(advance, scale.running_return, (reward, done))
+    batch_count = collectives.total(jnp.float32(returns.size))
+    batch_mean = collectives.mean(returns.mean())
+    batch_variance = collectives.mean(jnp.square(returns - batch_mean).mean())
+    count = scale.count + batch_count
+    delta = batch_mean - scale.mean
+    mean = scale.mean + delta * batch_count / count
+    squares = scale.variance * scale.count + batch_variance * batch_count
+    variance = (squares + delta**2 * scale.count * batch_count / count) / count
+    largest = jnp.maximum(scale.largest, collectives.largest(jnp.abs(returns).max()))
+    return ReturnScale(running, count, mean, variance, largest)
+
+
+def reward_multiplier(scale: ReturnScale, bound: float | None = None) -> jax.Array:
+    """`1 / std(G)`; with a bound less where that would lift the largest `|G|` above it.
+
+    Source of the bound: SimbaV2 (Lee et al. 2025).
+    """
+    multiplier = jax.lax.rsqrt(scale.variance + 1e-8)
+    return multiplier if bound is None else jnp.minimum(multiplier, bound / (scale.largest + 1e-8))

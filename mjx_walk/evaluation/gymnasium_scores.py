@@ -1,0 +1,141 @@
+"""Score a policy: in the real Gymnasium, or in a run's own engine."""
+
+import dataclasses
+import json
+import os
+import pickle
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from mjx_walk.common.rollout import evaluate
+from mjx_walk.envs import Task
+from mjx_walk.utils.subprocesses import start_module
+from mjx_walk.utils.types import PolicyFn
+from mjx_walk.utils.versions import package_versions
+
+
+@dataclasses.dataclass
+class Scores:
+    """Undiscounted returns and lengths of whole episodes."""
+
+    returns: np.ndarray
+    """`[N] f64`."""
+    lengths: np.ndarray
+    """`[N] i64`."""
+    seeds: list[int]
+    env: str
+
+    @property
+    def mean(self) -> float:
+        return float(self.returns.mean())
+
+    @property
+    def std(self) -> float:
+        return float(self.returns.std())
+
+    def __str__(self) -> str:
+        return (
+            f"{self.env}: {self.mean:,.1f} ± {self.std:,.1f} over {len(self.returns)} episodes, "
+            f"mean length {self.lengths.mean():,.1f}, lowest {self.returns.min():,.1f}"
+        )
+
+    def save(self, path: Path, **facts: Any) -> None:
+        """Write all episodes with the versions that made them, and any further facts, as JSON."""
+        content = {
+            "env": self.env,
+            "mean": self.mean,
+            "std": self.std,
+            "returns": self.returns.tolist(),
+            "lengths": self.lengths.tolist(),
+            "seeds": self.seeds,
+            "versions": package_versions(),
+            **facts,
+        }
+        unfinished = path.with_suffix(".unfinished")
+        unfinished.write_text(json.dumps(content, indent=1))
+        unfinished.replace(path)
+
+
+_MOST_SIDE_BY_SIDE = 1024
+"""Episodes that are played at once: an environment takes about 1 MB."""
+
+
+def score_in_gymnasium(task: Task, act: Callable[[np.ndarray], np.ndarray], num_episodes: int, seed: int = 0) -> Scores:
+    """Whole episodes in `gymnasium.make`: CPU MuJoCo, float64, the model's own solver.
+
+    The episodes run side by side, shared out over one process a core.
+
+    Args:
+        task: says which environment, with which keywords.
+        act: `[N, observation_size] f32 → [N, action_size] f32`, both in Gymnasium's units.
+        num_episodes: N.
+        seed: episode i is reset with `seed + i`.
+    """
+    seeds = [seed + i for i in range(num_episodes)]
+    rounds = [seeds[i : i + _MOST_SIDE_BY_SIDE] for i in range(0, num_episodes, _MOST_SIDE_BY_SIDE)]
+    returns, lengths = zip(*(_play_in_gymnasium(task, act, some) for some in rounds), strict=True)
+    return Scores(np.concatenate(returns), np.concatenate(lengths), seeds, task.gymnasium_id)
+
+
+def _play_in_gymnasium(
+    task: Task, act: Callable[[np.ndarray], np.ndarray], seeds: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns and lengths of the episodes that begin with these seeds, side by side."""
+    keywords = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
+    returns, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), np.int64)
+    is_over = np.zeros(len(seeds), bool)
+    shares = [share for share in np.array_split(np.arange(len(seeds)), os.cpu_count() or 1) if share.size]
+    workers = [_Worker() for _ in shares]
+    try:
+        for worker, share in zip(workers, shares, strict=True):
+            worker.send((task.gymnasium_id, keywords, [seeds[i] for i in share]))
+        obs = np.concatenate([worker.receive() for worker in workers])
+        while not is_over.all():
+            actions = np.asarray(act(obs.astype(np.float32)))
+            lengths += ~is_over
+            for worker, share in zip(workers, shares, strict=True):
+                worker.send(actions[share])
+            for worker, share in zip(workers, shares, strict=True):
+                obs[share], rewards, is_over[share] = worker.receive()
+                returns[share] += rewards
+    finally:
+        for worker in workers:
+            worker.close()
+    return returns, lengths
+
+
+class _Worker:
+    """A `gymnasium_worker` process. Not `multiprocessing`, which would import the user's main module again."""
+
+    def __init__(self) -> None:
+        self._process = start_module("evaluation.gymnasium_worker", stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
+    def send(self, message: Any) -> None:
+        assert self._process.stdin
+        pickle.dump(message, self._process.stdin, protocol=pickle.HIGHEST_PROTOCOL)
+        self._process.stdin.flush()
+
+    def receive(self) -> Any:
+        assert self._process.stdout
+        try:
+            return pickle.load(self._process.stdout)
+        except EOFError:
+            raise RuntimeError("a Gymnasium process ended; its error is above") from None
+
+    def close(self) -> None:
+        assert self._process.stdin and self._process.stdout
+        self._process.stdin.close()
+        self._process.stdout.close()
+        self._process.wait()
+
+
+def score_in_sim(task: Task, policy: PolicyFn, num_episodes: int, seed: int = 0) -> Scores:
+    """Whole episodes in the task's own engine, all side by side."""
+    returns, lengths = jax.jit(lambda key: evaluate(task, num_episodes, policy, key))(jax.random.PRNGKey(seed))
+    name = f"{task.gymnasium_id} on {task.engine.name}"
+    return Scores(np.asarray(returns, np.float64), np.asarray(lengths, np.int64), [seed], name)

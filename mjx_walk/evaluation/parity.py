@@ -1,0 +1,134 @@
+"""How far an MJX engine is from MuJoCo's C library, one step at a time.
+
+Long free-running trajectories prove nothing once a body has fallen: CPU Gymnasium diverges from itself after a
+perturbation of 1e-7. So every step starts anew from a state on a C trajectory.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_walk.envs import State, Task, make_env
+
+TOLERANCES = {"qpos": (1e-6, 2e-5), "qvel": (5e-5, 2e-3), "other": (1e-4, 1e-2)}
+"""Median and 99th percentile of each step's worst element: absolute for the physics state, relative for observation
+blocks and rewards."""
+
+AIRBORNE_HEIGHT = 1.0
+"""A third of the copies start this much higher, m."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Error:
+    """The error of one quantity, of each step its worst element, over all steps compared."""
+
+    name: str
+    median: float
+    p99: float
+    limits: tuple[float, float]
+
+    @property
+    def is_within(self) -> bool:
+        return self.median <= self.limits[0] and self.p99 <= self.limits[1]
+
+    def __str__(self) -> str:
+        verdict = "" if self.is_within else f"   EXCEEDS {self.limits[0]:.0e}, {self.limits[1]:.0e}"
+        return f"  {self.name:<18} median {self.median:.1e}   99% {self.p99:.1e}{verdict}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Parity:
+    """The outcome of one comparison."""
+
+    errors: list[Error]
+    num_steps: int
+    num_terminations: int
+    """Steps that ended an episode in the reference."""
+    termination_mismatches: int
+    overflows: int
+    nonfinite: int
+    """Steps whose physics broke in the engine; the state before them is kept, and each counts as terminated."""
+
+    @property
+    def is_within(self) -> bool:
+        return all(error.is_within for error in self.errors) and not (self.termination_mismatches or self.overflows)
+
+
+def reference_states(task: Task, num_copies: int, num_steps: int, seed: int) -> tuple[State, jax.Array]:
+    """States on C trajectories under random actions, and the action taken from each.
+
+    A third of the copies starts in the air; none is reset, so all lie on the floor in the end.
+
+    Returns:
+        `[num_steps · num_copies, …]`.
+    """
+    start_key, action_key = jax.random.split(jax.random.PRNGKey(seed))
+    start = jax.vmap(task.reset)(jax.random.split(start_key, num_copies)).physics
+    height = 2 if task.options.name.startswith("humanoid") else 1
+    lift = jnp.where(jnp.arange(num_copies) % 3 == 0, AIRBORNE_HEIGHT, 0.0)
+    state = jax.vmap(task.reset_to)(start.qpos.at[:, height].add(lift), start.qvel)
+
+    def one(state, key):
+        action = jax.random.uniform(
+            key, (num_copies, task.action_size), minval=task.action_low, maxval=task.action_high
+        )
+        return jax.vmap(task.step)(state, action), (state, action)
+
+    _, visited = jax.lax.scan(one, state, jax.random.split(action_key, num_steps))
+    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), visited)
+
+
+def one_step(task: Task, states: State, actions: jax.Array) -> State:
+    """The states, `[N, …]`, after one step, on the host."""
+    return jax.device_get(jax.jit(jax.vmap(task.step))(states, actions))
+
+
+def compare(task: Task, expected: State, found: State) -> Parity:
+    """Hold two engines' outcomes of the same steps against each other.
+
+    Args:
+        task: on either engine.
+        expected: `[N, …]`, the reference's.
+        found: `[N, …]`, the engine's.
+    """
+    errors = [
+        _error("qpos", expected.physics.qpos, found.physics.qpos, "qpos", is_relative=False),
+        _error("qvel", expected.physics.qvel, found.physics.qvel, "qvel", is_relative=False),
+    ]
+    start = 0
+    for name, size in task.observation_blocks().items():
+        block = np.s_[:, start : start + size]
+        errors.append(_error(f"obs {name}", expected.obs[block], found.obs[block]))
+        start += size
+    for name in task.reward_terms:
+        errors.append(_error(name, expected.metrics[name][:, None], found.metrics[name][:, None]))
+    errors.append(_error("reward", expected.reward[:, None], found.reward[:, None]))
+    return Parity(
+        errors,
+        num_steps=len(expected.reward),
+        num_terminations=int(expected.terminated.sum()),
+        termination_mismatches=int((expected.terminated != found.terminated).sum()),
+        overflows=int(found.metrics["overflow"].sum()),
+        nonfinite=int(found.metrics["nonfinite"].sum()),
+    )
+
+
+def _error(name: str, expected: jax.Array, found: jax.Array, kind: str = "other", is_relative: bool = True) -> Error:
+    difference = np.abs(np.float64(found) - expected)
+    if is_relative:
+        difference /= 1.0 + np.abs(expected)
+    worst = difference.max(axis=1)
+    return Error(name, float(np.median(worst)), float(np.quantile(worst, 0.99)), TOLERANCES[kind])
+
+
+def check(name: str, version: str, physics: str, num_copies: int, num_steps: int, seed: int = 0) -> Parity:
+    """Compare one task on one engine with the reference, which runs on the CPU whatever the engine runs on."""
+    cpu = jax.local_devices(backend="cpu")[0]
+    with jax.default_device(cpu):
+        reference = make_env(name, physics="c", version=version)
+        states, actions = jax.device_get(reference_states(reference, num_copies, num_steps, seed))
+        expected = one_step(reference, states, actions)
+    engine = make_env(name, physics=physics, version=version)
+    return compare(engine, expected, one_step(engine, states, actions))

@@ -1,0 +1,260 @@
+"""Save and restore a whole TrainState with Orbax: atomic, checked leaf by leaf, the newest few kept."""
+
+import json
+import os
+import shutil
+import warnings
+import zlib
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.versions import __version__
+
+FORMAT = 1
+"""Raised when older checkpoints can no longer be read."""
+
+_META = "meta.json"
+_ARRAYS = "arrays"
+_NUMPY = "arrays.npz"
+"""What processes but the first write into the same folders, and what is small."""
+_REPLAY = "replay"
+"""The TrainState's field that is kept in the newest checkpoint only, in a part of its own."""
+
+HostArrays = dict[str, np.ndarray]
+"""The leaves of a pytree by their paths, copied to the host."""
+
+
+def to_host(tree: Any) -> HostArrays:
+    """Copy a pytree, so that its own memory may be donated to the next program."""
+    return {name: np.array(leaf) for name, leaf in _named_leaves(jax.device_get(tree)).items()}
+
+
+def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False) -> None:
+    """Write a pytree of arrays. The folder appears under its name only when it is complete.
+
+    Args:
+        path: folder to make; one that is there is replaced.
+        tree: arrays of any dtype, or what `to_host` made of them.
+        meta: JSON-able facts to keep beside it; version and checksums are added.
+        as_numpy: whether in one file of NumPy's, compressed, instead of Orbax's folder.
+    """
+    arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
+    meta = meta | {
+        "format": FORMAT,
+        "mjx_walk": __version__,
+        "crc32": {name: _crc32(x) for name, x in arrays.items()},
+    }
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
+    replay = {name: x for name, x in arrays.items() if _is_replay(name)}
+    _write(unfinished / _ARRAYS, {name: x for name, x in arrays.items() if name not in replay}, as_numpy)
+    if replay:
+        _write(unfinished / _REPLAY, replay, as_numpy)
+    (unfinished / _META).write_text(json.dumps(meta))
+    former = path.with_name(f".{path.name}.former")
+    shutil.rmtree(former, ignore_errors=True)
+    if path.exists():
+        os.replace(path, former)  # at once, which removing a folder is not
+    os.replace(unfinished, path)
+    shutil.rmtree(former, ignore_errors=True)
+
+
+def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
+    """Read what `save` wrote.
+
+    Args:
+        path: its folder.
+        like: a pytree of arrays or `ShapeDtypeStruct`s of the same structure.
+
+    Returns:
+        The tree, on the default device, and the facts beside it. Where `prune` has taken the replay away, it is
+        empty, with a warning.
+
+    Raises:
+        UserError: made by an incompatible version, or for a TrainState of another shape.
+        ValueError: the folder is damaged.
+    """
+    meta = read_meta(path)
+    if meta.get("format") != FORMAT:
+        raise UserError(
+            f"{path} was written by mjx_walk {meta.get('mjx_walk')} in checkpoint format {meta.get('format')}; "
+            f"this is {__version__} with format {FORMAT}"
+        )
+    wanted = _named_leaves(like)
+    arrays = _read(path / _ARRAYS)
+    if any(_is_replay(name) for name in meta["crc32"]):
+        if (path / _REPLAY).exists():
+            arrays |= _read(path / _REPLAY)
+        else:
+            warnings.warn(f"{path} has no replay any more; it is filled again before learning goes on", stacklevel=2)
+            arrays |= {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in wanted.items() if _is_replay(name)}
+            meta["crc32"] = {name: crc for name, crc in meta["crc32"].items() if not _is_replay(name)}
+    for name, leaf in wanted.items():
+        if name in arrays and arrays[name].dtype.kind == "V":  # NumPy's files know no bfloat16
+            arrays[name] = arrays[name].view(leaf.dtype)
+    for name, crc in meta["crc32"].items():
+        if name not in arrays or _crc32(arrays[name]) != crc:
+            raise ValueError(f"{path} is damaged: {name} does not match its checksum")
+    for name, leaf in wanted.items():
+        if name not in arrays or arrays[name].shape != leaf.shape or arrays[name].dtype != leaf.dtype:
+            found = f"{arrays[name].shape} {arrays[name].dtype}" if name in arrays else "nothing"
+            raise UserError(
+                f"{path} is of another run, or of another version: "
+                f"{name} should be {leaf.shape} {leaf.dtype}, found {found}"
+            )
+    leaves = [jnp.asarray(arrays[name]) for name in wanted]
+    return jax.tree.unflatten(jax.tree.structure(like), leaves), meta
+
+
+def read_meta(path: Path) -> dict[str, Any]:
+    """The facts beside a checkpoint.
+
+    Raises:
+        ValueError: the folder is damaged.
+    """
+    try:
+        return json.loads((path / _META).read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def list_steps(folder: Path) -> list[Path]:
+    """Checkpoints of a run, oldest first. Their names are zero-padded environment steps."""
+    return sorted(path for path in folder.glob("[0-9]*") if path.name.isdecimal() and path.is_dir())
+
+
+def step_path(folder: Path, env_steps: int) -> Path:
+    """Where the checkpoint of a number of environment steps lies."""
+    return folder / f"{env_steps:013d}"
+
+
+def restore_newest(
+    folder: Path,
+    like: Any,
+    part: Callable[[Path], Path] = lambda path: path,
+    agree: Callable[[bool], bool] = lambda is_whole: is_whole,
+) -> tuple[Any, dict[str, Any]]:
+    """The newest checkpoint that is whole; a damaged one is passed over with a warning.
+
+    Args:
+        folder: of the checkpoints.
+        like: as for `restore`.
+        part: what to read of the checkpoint at a path; ValueError where that cannot be told.
+        agree: whether to take it, asked once for each that is tried, with whether that part is whole.
+
+    Raises:
+        UserError: there is none, or it belongs to another run.
+    """
+    for path in reversed(list_steps(folder)):
+        found = None
+        try:
+            found = restore(part(path), like)
+        except UserError:
+            raise
+        except ValueError as error:
+            warnings.warn(f"{error}; falling back to the checkpoint before it", stacklevel=2)
+        if agree(found is not None) and found:
+            return found
+    raise UserError(f"no usable checkpoint in {folder}; nothing to resume")
+
+
+def prune(folder: Path, keep: int) -> None:
+    """Remove all but the newest `keep` checkpoints, the replay of all but the newest, and interrupted saves."""
+    for path in list_steps(folder)[:-keep]:
+        shutil.rmtree(path)
+    for path in list_steps(folder)[:-1]:
+        shutil.rmtree(path / _REPLAY, ignore_errors=True)
+    for path in folder.glob(".*.unfinished"):
+        shutil.rmtree(path)
+
+
+class BackgroundSaver:
+    """Writes checkpoints while training goes on, one at a time: training waits only for the copy to the host."""
+
+    def __init__(self, folder: Path, keep: int):
+        """
+        Args:
+            folder: of the checkpoints.
+            keep: newest ones kept.
+        """
+        self._folder = folder
+        self._keep = keep
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
+        self._running: Future[None] | None = None
+
+    def save(self, *parts: tuple[Path, Any, dict[str, Any]]) -> None:
+        """Copy pytrees to the host and begin to write them, in turn; each as the arguments of `checkpoint.save`.
+
+        Waits for those before.
+        """
+        self.wait()
+        copied = [(path, to_host(tree), meta) for path, tree, meta in parts]
+        self._running = self._executor.submit(self._save, copied)
+
+    def wait(self) -> None:
+        """Until nothing is being written.
+
+        Raises:
+            OSError: the disk is full, or what else went wrong in writing.
+        """
+        if self._running:
+            self._running.result()
+            self._running = None
+
+    def _save(self, parts: list[tuple[Path, HostArrays, dict[str, Any]]]) -> None:
+        for path, arrays, meta in parts:
+            save(path, arrays, meta)
+        prune(self._folder, self._keep)
+
+
+def _is_replay(name: str) -> bool:
+    return name.startswith(f"{_REPLAY}.")
+
+
+def _write(path: Path, arrays: HostArrays, as_numpy: bool) -> None:
+    if as_numpy or jax.process_index():  # Orbax writes arrays of the host from the first process alone
+        path.mkdir()
+        write = np.savez_compressed if as_numpy else np.savez
+        write(path / _NUMPY, allow_pickle=False, **arrays)
+        return
+    with _checkpointer() as checkpointer:
+        checkpointer.save(path.absolute(), arrays)
+
+
+def _read(path: Path) -> HostArrays:
+    try:
+        if (path / _NUMPY).exists():
+            with np.load(path / _NUMPY) as arrays:
+                return dict(arrays)
+        with _checkpointer() as checkpointer:
+            return checkpointer.restore(path.absolute())
+    except Exception as error:  # Orbax reports damage through many types
+        raise ValueError(f"{path} is damaged: {str(error).splitlines()[0][:200]}") from error
+
+
+def _checkpointer() -> ocp.Checkpointer:
+    """Orbax's, which by default would wait for all processes of a team; each writes and reads for itself."""
+    options = ocp.options.MultiprocessingOptions()
+    if jax.process_count() > 1:
+        rank = jax.process_index()
+        options = ocp.options.MultiprocessingOptions(rank, {rank}, f"process_{rank}")
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=options)
+    return ocp.Checkpointer(handler, multiprocessing_options=options)
+
+
+def _crc32(array: np.ndarray) -> int:
+    return zlib.crc32(np.ascontiguousarray(array).view(np.uint8).data)
+
+
+def _named_leaves(tree: Any) -> dict[str, Any]:
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}

@@ -1,0 +1,240 @@
+"""The configuration: its schema, and how command lines become it."""
+
+import dataclasses
+import difflib
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from mjx_walk.algos import ALGORITHMS
+from mjx_walk.envs import TASKS
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.envs.physics import ENGINES
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import setting, validate
+
+CONFIG_DIR = str(Path(__file__).parents[1] / "configs")
+
+
+@dataclasses.dataclass
+class CheckpointConfig:
+    """Saving."""
+
+    every_chunks: int = setting(50, at_least=1)
+    keep: int = setting(3, at_least=1)
+    """Newest checkpoints kept; the best policy is kept beside them."""
+
+
+@dataclasses.dataclass
+class Config:
+    """One training run."""
+
+    env: Any = None
+    """A task's options, see `mjx_walk.envs`."""
+    algo: Any = None
+    """An algorithm's settings, see `mjx_walk.algos`."""
+    hardware: str = setting("gpu", choices=("gpu", "cpu"))
+    """Which size of recipe; chosen by itself."""
+    physics: str = setting("auto", choices=("auto", *ENGINES))
+    seed: int = setting(0, at_least=0, at_most=2**32 - 1)
+    num_envs: int = setting(8192, at_least=1)
+    total_steps: int = setting(100_000_000, at_least=1)
+    """Environment steps over all copies, rounded up to whole chunks."""
+    updates_per_chunk: int = setting(1, at_least=1)
+    """Updates compiled into one program call; logging, evaluation and saving happen between chunks. With a single one
+    Warp records its kernels anew in most chunks, since some of what physics reads has moved."""
+    run_dir: str | None = None
+    """By default `runs/ENV_ALGO/TIME`."""
+    resume: bool = False
+    wandb_project: str | None = None
+    """Log to this project of Weights & Biases, too."""
+    matmul_precision: str = setting("tensorfloat32", choices=("tensorfloat32", "float32"))
+    """Of the networks; never of the physics."""
+    evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+    checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
+
+
+def register_schemas() -> None:
+    """Tell Hydra the schema and the groups that are classes: `env` and `algo`."""
+    store = ConfigStore.instance()
+    store.store(name="schema", node=Config)
+    for name, (_, options) in TASKS.items():
+        store.store(group="env", name=name, node=options)
+    for name, (_, settings) in ALGORITHMS.items():
+        store.store(group="algo", name=name, node=settings)
+
+
+def load_config(overrides: list[str]) -> Config:
+    """Compose and check a configuration.
+
+    Args:
+        overrides: as on the command line, `["env=walker2d", "algo.discount=0.99"]`. Without `hardware=` the size
+            of the recipe follows from the devices that JAX sees.
+
+    Raises:
+        UserError: anything wrong, in one line that names the valid choices.
+    """
+    overrides = complete_overrides(overrides)
+    register_schemas()
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
+            node = compose("train", overrides)
+        return to_config(node)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(_one_line(error, overrides)) from error
+
+
+def to_config(node: Any) -> Config:
+    """The checked dataclasses behind a composed OmegaConf node.
+
+    Raises:
+        UserError: a value is out of range.
+    """
+    config = OmegaConf.to_object(node)
+    assert isinstance(config, Config)
+    validate(config)
+    return config
+
+
+def complete_overrides(overrides: list[str]) -> list[str]:
+    """Refuse the override forms that slip past the schema, and add the recipe's size.
+
+    Raises:
+        UserError: `+key`, `++key`, `~key`, something that is no override, or an unknown environment or algorithm.
+    """
+    try:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+    except HydraException as error:
+        raise UserError(f"cannot read the command line: {_first_line(error)}") from error
+    for override in parsed:
+        key = override.key_or_group
+        if key.startswith("hydra"):
+            continue
+        if override.is_add() or override.is_force_add() or override.is_delete():
+            raise UserError(f"'{override.input_line}': keys cannot be added or removed; write {key}=VALUE")
+        known = {"env": TASKS, "algo": ALGORITHMS}.get(key)
+        if known and not override.is_sweep_override() and override.value() not in known:
+            raise UserError(f"unknown {key} '{override.value()}'; choose one of: {', '.join(known)}")
+    overrides = [_as_text(override) for override in parsed]
+    if not any(override.key_or_group == "hardware" for override in parsed):
+        overrides = [f"hardware={'cpu' if jax.default_backend() == 'cpu' else 'gpu'}", *overrides]
+    return overrides
+
+
+def _as_text(override: Override) -> str:
+    """As it was written; what is a text in quotes, since Hydra would read the folder 2026_11_23 as a number."""
+    key, line = override.key_or_group, str(override.input_line)
+    if key in ("run_dir", "wandb_project") and isinstance(override.value(), (bool, int, float)):
+        return f"{key}='{line.partition('=')[2]}'"
+    return line
+
+
+def flatten(config: Config) -> dict[str, Any]:
+    """Every setting by its full key, as the run folder's `config.yaml` would give it back."""
+
+    def walk(value: Any, prefix: str):
+        for key, item in value.items():
+            if isinstance(item, dict):
+                yield from walk(item, f"{prefix}{key}.")
+            else:
+                yield prefix + key, item
+
+    return dict(walk(yaml.safe_load(OmegaConf.to_yaml(OmegaConf.structured(config))), ""))
+
+
+def save_config(config: Config, path: Path) -> None:
+    """Write the resolved configuration as YAML."""
+    path.write_text(OmegaConf.to_yaml(OmegaConf.structured(config)))
+
+
+def read_config(path: Path) -> Config:
+    """Read what `save_config` wrote.
+
+    Raises:
+        UserError: the file is not a configuration of this version.
+    """
+    try:
+        saved = OmegaConf.load(path)
+        schema = OmegaConf.structured(Config(env=TASKS[saved.env.name][1](), algo=ALGORITHMS[saved.algo.name][1]()))
+        return to_config(OmegaConf.merge(schema, saved))
+    except (KeyError, AttributeError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise UserError(f"{path} is not a configuration of this version: {_first_line(error)}") from error
+
+
+def _first_line(error: BaseException) -> str:
+    return next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+
+
+def _one_line(error: BaseException, overrides: list[str]) -> str:
+    """What the user needs of a Hydra error: its useful detail often sits in the cause."""
+    texts = [str(error), str(error.__cause__ or "")]
+    if "raised while composing config" in texts[0]:  # Hydra's first line names the file, the second what is wrong
+        file, wrong = (line.strip() for line in texts[0].splitlines()[:2])
+        return f"{file.partition(':')[0]}: {wrong}; this recipe does not suit the env and algo that were asked for"
+    if any("not in struct" in text or "not in '" in text or "Could not override" in text for text in texts):
+        valid = list(
+            flatten(load_config([o for o in overrides if o.startswith(("env=", "algo=", "hardware=", "recipe="))]))
+        )
+        given = [override.split("=", 1)[0] for override in overrides]
+        unknown = [key for key in given if key not in valid and key not in ("env", "algo", "recipe", "hardware")]
+        if unknown:
+            near = difflib.get_close_matches(unknown[0], valid, n=3, cutoff=0.4)
+            section = unknown[0].rpartition(".")[0]
+            choices = near or [key for key in valid if key.rpartition(".")[0] == section] or valid
+            return f"unknown key '{unknown[0]}'; did you mean: {', '.join(choices)}?"
+    if "Could not find 'recipe/" in texts[0]:
+        return f"{_first_line(error)}; recipes: {', '.join(recipe_names())}"
+    key = getattr(error, "full_key", None) or getattr(error.__cause__, "full_key", None)
+    detail = _first_line(error.__cause__ or error)
+    return f"{key}: {detail}" if key else detail
+
+
+def recipe_names() -> list[str]:
+    """What `recipe=` can be: `cpu/humanoid_ppo`."""
+    folder = Path(CONFIG_DIR) / "recipe"
+    return sorted(str(path.relative_to(folder).with_suffix("")) for path in folder.glob("**/[!_]*.yaml"))
+
+
+def training_command(config: Config) -> str:
+    """What trains with these settings, in few words: a recipe for task and algorithm, and what differs from it."""
+    given = [f"env={config.env.name}", f"algo={config.algo.name}"]
+    usual = f"{config.hardware}/{config.env.name}_{config.algo.name}"
+    recipes = [f"recipe={name}" for name in recipe_names() if Path(name).name == Path(usual).name and name != usual]
+    own = flatten(config)
+    commands = []
+    for asked in (given, *([*given, recipe] for recipe in recipes)):
+        settings = flatten(load_config([f"hardware={config.hardware}", *asked]))
+        learned_from = (key for key in sorted(own) if not key.startswith(_NOT_LEARNED_FROM))
+        commands.append([*asked, *(f"{key}={own[key]}" for key in learned_from if own[key] != settings.get(key))])
+    return " ".join(["python -m mjx_walk.train", *min(commands, key=len)])
+
+
+_NOT_LEARNED_FROM = (
+    "hardware",
+    "physics",
+    "updates_per_chunk",
+    "run_dir",
+    "resume",
+    "wandb",
+    "evaluation.",
+    "checkpoint.",
+)
+"""How the keys begin that a command may leave out and still train the same."""
+
+
+def compile_cache_dir() -> str:
+    """Where compiled programs are kept between runs: `JAX_COMPILATION_CACHE_DIR`, else the user's cache."""
+    default = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "mjx_walk" / "jax"
+    return os.environ.get("JAX_COMPILATION_CACHE_DIR", str(default))

@@ -1,0 +1,94 @@
+"""The policy of a run, kept apart from its checkpoints: small enough to ship."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from mjx_walk.algos import make_algorithm
+from mjx_walk.envs import TASKS, Task
+from mjx_walk.envs.physics import resolve_engine
+from mjx_walk.envs.rewards import reward_file
+from mjx_walk.runs import checkpoint
+from mjx_walk.runs.config import Config, read_config
+from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.types import Algorithm
+
+
+class SavedPolicy:
+    """The best policy of a run folder, with the task that it was trained on."""
+
+    def __init__(self, folder: RunFolder, physics: str | None = None):
+        """
+        Args:
+            folder: of a run that has saved a policy.
+            physics: engine to use instead of the one that the run was trained on.
+
+        Raises:
+            UserError: there is no usable policy.
+        """
+        self.path = folder.path
+        self.config = _without_lost_reward(read_config(folder.config))
+        engine = physics or _engine_here(self.config.physics)
+        self.task = make_task(dataclasses.replace(self.config, physics=engine))
+        # It acts in float32, whatever it learned in: the same on every machine.
+        algo = dataclasses.replace(self.config.algo, network_dtype="float32")
+        self.algorithm = make_algorithm(self.task, self.config.num_envs, self.config.evaluation, algo)
+        state = jax.eval_shape(self.algorithm.init, jax.random.PRNGKey(0))
+        like = jax.eval_shape(self.algorithm.policy_params, state)
+        self.policy_params, self.policy_facts = _load_best_policy(folder, like)
+
+    @functools.cached_property
+    def act(self) -> Callable:
+        """`policy` as a compiled JAX function of f32 observations."""
+        return deterministic_act(self.algorithm, self.policy_params)
+
+    def policy(self, obs: np.ndarray) -> np.ndarray:
+        """The deterministic action for one observation or a batch, in Gymnasium's units on both sides.
+
+        Args:
+            obs: `[…, observation_size]`, any float dtype.
+        """
+        return np.asarray(self.act(np.asarray(obs, np.float32)))
+
+
+def make_task(config: Config) -> Task:
+    """The unbatched environment of a configuration."""
+    return TASKS[config.env.name][0](config.env, config.physics)
+
+
+def deterministic_act(algorithm: Algorithm, policy_params: Any) -> Callable[[Any], Any]:
+    """The policy without noise, compiled: `obs […, observation_size] → action […, action_size]`, Gymnasium's units."""
+    policy = algorithm.policy(policy_params, deterministic=True)
+    return jax.jit(lambda obs: policy(obs, jax.random.PRNGKey(0)))
+
+
+def _load_best_policy(folder: RunFolder, like: Any) -> tuple[Any, dict[str, Any]]:
+    if not folder.best_policy.exists():
+        raise UserError(f"{folder.path} holds no policy yet; train it first")
+    try:
+        return checkpoint.restore(folder.best_policy, like)
+    except UserError:
+        raise
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
+def _engine_here(name: str) -> str:
+    """The engine that a run was trained on, or this machine's own, where that one does not run."""
+    try:
+        return resolve_engine(name)
+    except UserError:
+        return "auto"
+
+
+def _without_lost_reward(config: Config) -> Config:
+    """Without a reward function whose file is gone: neither the policy nor its score needs it."""
+    source = config.env.reward_function
+    if source is None or reward_file(source).is_file():
+        return config
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, reward_function=None))

@@ -1,0 +1,135 @@
+"""The folder of a run: what belongs where, and who may write into it."""
+
+import dataclasses
+import datetime
+from pathlib import Path
+
+from mjx_walk.runs.checkpoint import list_steps
+from mjx_walk.runs.config import Config, flatten, read_config, save_config
+from mjx_walk.utils.errors import UserError
+
+MAY_DIFFER = ("run_dir", "resume", "total_steps", "algo.schedule_steps", "wandb_project", "evaluation.films")
+"""Keys that a resumed run may be given anew."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFolder:
+    """Paths inside a run folder."""
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        return self.path / "config.yaml"
+
+    @property
+    def metrics(self) -> Path:
+        return self.path / "metrics.jsonl"
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def best_policy(self) -> Path:
+        return self.checkpoints / "best"
+
+    @property
+    def gymnasium_scores(self) -> Path:
+        return self.path / "eval_gymnasium.json"
+
+
+def new_path(config: Config) -> Path:
+    """Where a run goes if nothing is said."""
+    now = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    return Path("runs") / f"{config.env.name}_{config.algo.name}" / now
+
+
+def open_existing(path: str | Path | None) -> RunFolder:
+    """A folder that a run has written.
+
+    Raises:
+        UserError: none is given, or there is no run at that path.
+    """
+    if path is None:
+        raise UserError("say which run: run=RUN_DIR")
+    folder = RunFolder(Path(path))
+    if not folder.config.is_file():
+        raise UserError(f"no run at '{path}': give the folder that holds its config.yaml")
+    return folder
+
+
+def prepare(configs: list[Config]) -> tuple[list[RunFolder], list[Config]]:
+    """The folders to train in side by side, made or resumed. All are looked at before any is touched, and nothing that
+    is there is overwritten.
+
+    Args:
+        configs: of the runs, which may differ in `seed` and `run_dir`.
+
+    Returns:
+        The folders, and the configurations with `run_dir` filled in.
+
+    Raises:
+        UserError: a folder holds something else, or another run; or, to resume, another configuration, or runs that
+            cannot go on side by side.
+    """
+    first = configs[0]
+    if first.run_dir is None:
+        if first.resume:
+            raise UserError("resume=true needs run_dir=PATH of the run to go on with")
+        configs = [dataclasses.replace(config, run_dir=str(new_path(config))) for config in configs]
+    folders = [RunFolder(Path(str(config.run_dir))) for config in configs]
+    for folder, config in zip(folders, configs, strict=True):
+        _check(folder, config)
+        differing = differences(first, config, besides=("run_dir", "resume", "seed"))
+        if differing:
+            raise UserError(f"{folder.path} and {folders[0].path} differ in {'; '.join(differing)}; resume each alone")
+    steps = {_newest(folder) for folder in folders}
+    if len(steps) > 1:
+        raise UserError(f"the seeds stand at different steps ({', '.join(sorted(steps))}); resume each alone")
+    for folder, config in zip(folders, configs, strict=True):
+        try:
+            folder.checkpoints.mkdir(parents=True, exist_ok=config.resume)
+            if not config.resume:  # else once there is a checkpoint to go on from
+                save_config(config, folder.config)
+        except OSError as error:
+            raise UserError(f"cannot write to run_dir={config.run_dir}: {error.strerror}") from error
+    return folders, configs
+
+
+def differences(saved: Config, config: Config, besides: tuple[str, ...] = MAY_DIFFER) -> list[str]:
+    """The settings in which a run differs from what is asked for now, or from another one."""
+    old, new = flatten(saved), flatten(config)
+    return [
+        f"{key} (was {old.get(key)}, now {new.get(key)})"
+        for key in sorted(old.keys() | new.keys())
+        if key not in besides and old.get(key) != new.get(key)
+    ]
+
+
+def _check(folder: RunFolder, config: Config) -> None:
+    """That a run may begin, or go on, in a folder."""
+    if folder.path.exists() and not folder.path.is_dir():
+        raise UserError(f"run_dir={config.run_dir} is a file; choose another path")
+    if not config.resume:
+        if folder.config.exists():
+            raise UserError(f"run_dir={config.run_dir} holds a run already; add resume=true, or choose another path")
+        if folder.path.exists() and any(folder.path.iterdir()):
+            raise UserError(f"run_dir={config.run_dir} exists and is not a run folder; choose another path")
+        return
+    saved = read_config(open_existing(folder.path).config)
+    differing = differences(saved, config)
+    if differing:
+        raise UserError(f"resume=true with another configuration than {folder.config}: {'; '.join(differing)}")
+    if folder.gymnasium_scores.exists() and not list_steps(folder.checkpoints):
+        raise UserError(
+            f"no checkpoint in {folder.checkpoints}, though the run was scored; begin it in another run_dir"
+        )
+    if config.total_steps < saved.total_steps:
+        raise UserError(f"total_steps={config.total_steps} is below this run's {saved.total_steps}; it may only grow")
+
+
+def _newest(folder: RunFolder) -> str:
+    """The steps behind the newest checkpoint."""
+    saved = list_steps(folder.checkpoints)
+    return f"{int(saved[-1].name):,}" if saved else "0"

@@ -1,0 +1,102 @@
+"""`devices=N`: a process for each GPU of this host, which make up a `Team`."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from mjx_walk.utils.devices import count_devices, only_device
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.signals import Interrupt, exit_code
+
+_PATIENCE = 20.0
+"""Seconds that the others are given to end once one process has ended badly."""
+
+
+def count(asked: int | str) -> int:
+    """How many processes `devices=N` or `devices=all` is.
+
+    Raises:
+        UserError: this host has fewer GPUs.
+    """
+    hardware, available = count_devices()
+    if asked == "all":
+        return available
+    if not isinstance(asked, int) or asked < 1:
+        raise UserError(f"devices={asked}: write devices=all, or a number from 1 up")
+    if hardware == "gpu" and asked > available:
+        raise UserError(f"devices={asked}: this host has {available}")
+    return asked
+
+
+def run(arguments: list[str], size: int) -> int:
+    """Train in `size` processes. The first one's output is shown; Ctrl-C and SIGTERM reach all.
+
+    Returns:
+        The exit code: that of a signal, 2 for a user's mistake, 1 where a process has died.
+    """
+    with tempfile.TemporaryDirectory() as logs, Interrupt("all devices finish their chunk, then save") as interrupt:
+        processes = _start(arguments, size, Path(logs))
+        has_told = False
+        bad: list[int] = []
+        while any(process.poll() is None for process in processes) and not bad:
+            if interrupt.signal_name and not has_told:
+                has_told = True
+                for process in processes:
+                    process.send_signal(signal.Signals[interrupt.signal_name])
+            time.sleep(0.2)
+            bad = [rank for rank, process in enumerate(processes) if process.poll()]
+        _end(processes)
+        if not bad:
+            return 0
+        rank = min(bad, key=lambda rank: (processes[rank].returncode > 0, rank))  # one that was killed, if any
+        code = processes[rank].returncode
+        if interrupt.signal_name:
+            return exit_code(interrupt.signal_name)
+        if rank:
+            print(_log(Path(logs), rank).read_text(errors="replace")[-2000:], file=sys.stderr)
+        if code != 2:  # which says itself what is wrong
+            print(
+                f"error: the process of device {rank} died; what was saved is whole, add resume=true", file=sys.stderr
+            )
+        return 2 if code == 2 else 1
+
+
+def _start(arguments: list[str], size: int, logs: Path) -> list[subprocess.Popen]:
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        coordinator = f"localhost:{free.getsockname()[1]}"
+    processes = []
+    for rank in range(size):
+        env = os.environ | {"MJX_WALK_TEAM": f"{rank},{size},{coordinator}"} | only_device(rank)
+        with _log(logs, rank).open("w") as log:
+            output = log if rank else None
+            processes.append(
+                subprocess.Popen(
+                    [sys.executable, "-m", "mjx_walk.train", *arguments],
+                    env=env,
+                    stdout=output,
+                    stderr=output,
+                    start_new_session=True,
+                )
+            )
+    return processes
+
+
+def _log(logs: Path, rank: int) -> Path:
+    return logs / f"{rank}.txt"
+
+
+def _end(processes: list[subprocess.Popen]) -> None:
+    """Wait a little for the others of a process that has ended badly, which wait for it in vain; then end them."""
+    deadline = time.monotonic() + _PATIENCE
+    while time.monotonic() < deadline and any(process.poll() is None for process in processes):
+        time.sleep(0.2)
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+        process.wait()

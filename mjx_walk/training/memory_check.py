@@ -1,0 +1,48 @@
+"""Whether a run fits the memory and the disk, said before anything is allocated."""
+
+import shutil
+from pathlib import Path
+
+import jax
+
+from mjx_walk.utils.devices import device_memory, num_bytes
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.types import Algorithm
+
+_USABLE = 0.9
+"""Share of the device's memory that a replay may take."""
+
+
+def check_replay(algorithm: Algorithm, run_dir: Path, num_runs: int = 1) -> str | None:
+    """Say what a replay takes of memory and disk.
+
+    Args:
+        algorithm: what is to run.
+        run_dir: where it is to be saved; it need not exist.
+        num_runs: how many are to run side by side.
+
+    Returns:
+        One line, or None where there is no replay.
+
+    Raises:
+        UserError: it does not fit.
+    """
+    if not algorithm.replay_bytes:
+        return None
+    replay_bytes = num_runs * algorithm.replay_bytes
+    checkpoint_bytes = num_runs * num_bytes(algorithm.init, jax.random.PRNGKey(0))
+    replay, disk = f"{replay_bytes / 1e9:,.2f} GB", f"{2 * checkpoint_bytes / 1e9:,.2f} GB"
+    memory = device_memory()
+    if replay_bytes > _USABLE * memory:
+        fewer = " or train fewer seeds side by side (compare: together=1)" if num_runs > 1 else ""
+        raise UserError(
+            f"the replay needs {replay}, but the device has {memory / 1e9:,.2f} GB; lower algo.replay_capacity{fewer}"
+        )
+    existing = next(path for path in (run_dir.absolute(), *run_dir.absolute().parents) if path.exists())
+    free = shutil.disk_usage(existing).free
+    if 2 * checkpoint_bytes > free:
+        raise UserError(
+            f"checkpoints with their replay need {disk} of disk, but {existing} has {free / 1e9:,.2f} GB left; lower "
+            "algo.replay_capacity or choose another run_dir"
+        )
+    return f"Replay: {replay} of device memory, and while a checkpoint replaces the one before up to {disk} of disk."

@@ -1,0 +1,40 @@
+"""The devices of this machine: how many, which one a process sees, and how much memory it has."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from mjx_walk.utils.errors import UserError
+
+
+def count_devices() -> tuple[str, int]:
+    """`gpu` or `cpu`, and how many; asked in another process, since JAX would claim the memory of all of them."""
+    code = "import jax; print(jax.default_backend() != 'cpu', jax.local_device_count())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise UserError(f"JAX does not start: {done.stderr.strip().splitlines()[-1]}")
+    is_gpu, count = done.stdout.split()[-2:]
+    return ("gpu", int(count)) if is_gpu == "True" else ("cpu", 1)
+
+
+def only_device(device: int) -> dict[str, str]:
+    """The environment variable that lets a process see one of the GPUs that this one sees."""
+    visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
+    return {"CUDA_VISIBLE_DEVICES": visible[device] if visible else str(device)}
+
+
+def num_bytes(make: Callable[..., Any], *args: Any) -> int:
+    """Bytes of the pytree that `make` would return, without making it."""
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(make, *args)))
+
+
+def device_memory() -> int:
+    """Bytes that JAX may allocate on its first device."""
+    stats = jax.local_devices()[0].memory_stats()
+    if stats and "bytes_limit" in stats:
+        return stats["bytes_limit"]
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -1,0 +1,127 @@
+"""An episode as one page that plays it in 3D in any browser, offline."""
+
+import base64
+import importlib.util
+import json
+import re
+import string
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjx_walk.utils.errors import UserError
+from mjx_walk.viewing.episode import Episode
+
+_TEMPLATE = Path(__file__).with_name("page.html")
+_SHAPES = {
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
+}
+_NUM_VISIBLE_GROUPS = 3
+"""MuJoCo's viewer shows geoms of the first three groups; the others are for collisions."""
+
+
+def require_library() -> Path:
+    """The 3D library that goes into a page: MeshCat's viewer, which holds three.js.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    # Not imported: only its file is wanted.
+    package = importlib.util.find_spec("meshcat")
+    if package is None or not package.submodule_search_locations:
+        raise UserError("html= needs MeshCat, whose 3D viewer goes into the page: pip install meshcat")
+    return Path(package.submodule_search_locations[0]) / "viewer" / "dist" / "main.min.js"
+
+
+def write_page(episode: Episode, path: Path) -> Path:
+    """Write the page, about 1.5 MB.
+
+    Raises:
+        UserError: the 3D library is not installed.
+    """
+    seconds = f"{len(episode.rewards)} steps, {episode.seconds[-1]:.1f} s"
+    summary = f"return {episode.rewards.sum():,.0f} in {seconds}, in the real Gymnasium"
+    poses = _body_poses(episode)
+    data = {
+        "summary": summary,
+        "num_steps": len(episode.rewards),
+        "num_bodies": episode.model.nbody,
+        "seconds_per_step": episode.seconds_per_step,
+        "eye_height": round(float(episode.torso[:, 2].max()) * 0.6, 3),
+        "geoms": _geoms(episode.model),
+        "floors": _floors(episode.model),
+        "poses": base64.b64encode(poses.astype("<f4").tobytes()).decode(),
+        "returns": [round(float(value), 2) for value in np.cumsum(episode.rewards)],
+        "series": {name: [round(float(v), 4) for v in values] for name, values in episode.reward_terms.items()},
+    }
+    page = string.Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
+        title=episode.env,
+        library=_inside_script(require_library().read_text(encoding="utf-8")),
+        episode=_inside_script(json.dumps(data, separators=(",", ":"))),
+    )
+    path.write_text(page, encoding="utf-8")
+    return path
+
+
+def _inside_script(text: str) -> str:
+    """The same text, JavaScript or JSON, without what would end the element around it."""
+    return re.sub("</(?=script)", r"<\\/", text, flags=re.IGNORECASE)
+
+
+def _body_poses(episode: Episode) -> np.ndarray:
+    """Position, and rotation as three.js wants it (x, y, z, w), of every body after every step, `[T, nbody, 7]`."""
+    model = episode.model
+    data = mujoco.MjData(model)
+    poses = np.zeros((len(episode.qpos), model.nbody, 7))
+    for pose, qpos in zip(poses, episode.qpos, strict=True):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        pose[:, :3] = data.xpos
+        pose[:, 3:] = data.xquat[:, [1, 2, 3, 0]]
+    return poses
+
+
+def _geoms(model: mujoco.MjModel) -> list[dict[str, Any]]:
+    """Those that are seen and that the page can draw: not planes, height fields and signed distance functions."""
+    geoms = []
+    for i in range(model.ngeom):
+        shape = _SHAPES.get(mujoco.mjtGeom(model.geom_type[i]))
+        rgba = model.mat_rgba[model.geom_matid[i]] if model.geom_matid[i] >= 0 else model.geom_rgba[i]
+        if shape is None or model.geom_group[i] >= _NUM_VISIBLE_GROUPS or rgba[3] == 0:
+            continue
+        geom = {
+            "type": shape,
+            "body": int(model.geom_bodyid[i]),
+            "size": _rounded(model.geom_size[i]),
+            "pos": _rounded(model.geom_pos[i]),
+            "quat": _rounded(model.geom_quat[i][[1, 2, 3, 0]]),
+            "rgba": _rounded(rgba),
+        }
+        geoms.append(geom | (_mesh(model, int(model.geom_dataid[i])) if shape == "mesh" else {}))
+    return geoms
+
+
+def _mesh(model: mujoco.MjModel, mesh: int) -> dict[str, list]:
+    """Its corners, three numbers each, and its triangles, three corners each."""
+    corners = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
+    triangles = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
+    return {
+        "vertices": _rounded(model.mesh_vert[corners].ravel()),
+        "faces": model.mesh_face[triangles].ravel().tolist(),
+    }
+
+
+def _floors(model: mujoco.MjModel) -> list[float]:
+    """The height of each plane, m."""
+    return _rounded(model.geom_pos[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, 2])
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    return [round(float(value), 5) for value in values]

@@ -1,0 +1,51 @@
+"""A policy in MuJoCo's own live viewer."""
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mjx_walk.envs import Task
+from mjx_walk.utils.errors import UserError
+from mjx_walk.viewing.episode import make_gymnasium
+
+
+def show(task: Task, policy: Callable[[np.ndarray], np.ndarray], seed: int = 0) -> None:
+    """Play episodes in real time, one after the other, until the window is closed.
+
+    Args:
+        task: says which environment, with which keywords.
+        policy: `[observation_size] → [action_size]`, both in Gymnasium's units.
+        seed: of the first episode.
+
+    Raises:
+        UserError: there is no screen, or macOS wants another interpreter.
+    """
+    import glfw
+    import mujoco.viewer
+
+    if not glfw.init():
+        raise UserError("viewer=true needs a screen; leave it out to get a film instead")
+    env = make_gymnasium(task)
+    inner: Any = env.unwrapped
+    try:
+        window = mujoco.viewer.launch_passive(inner.model, inner.data, show_left_ui=False, show_right_ui=False)
+    except RuntimeError as error:
+        hint = "on macOS run it with mjpython instead of python" if sys.platform == "darwin" else str(error)
+        raise UserError(f"the viewer could not be opened: {hint}") from error
+    with window:
+        window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+        window.cam.trackbodyid, window.cam.distance = 1, 4.0
+        while window.is_running():
+            obs, _ = env.reset(seed=seed)
+            seed += 1
+            is_over = False
+            while window.is_running() and not is_over:
+                began = time.perf_counter()
+                obs, _, terminated, truncated, _ = env.step(policy(obs))
+                is_over = terminated or truncated
+                window.sync()
+                time.sleep(max(0.0, inner.dt - (time.perf_counter() - began)))
+    env.close()
