@@ -46,7 +46,9 @@ class Humanoid(HumanoidBody):
         mass = jnp.asarray(self.model.body_mass, jnp.float32)
         return {"mass_center": (mass[:, None] * derived["xipos"]).sum(0)[:2] / mass.sum()}
 
-    def evaluate(self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array):
+    def reward_and_termination(
+        self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array
+    ):
         options = self.options
         low, high = options.healthy_z_range
         is_healthy = (low < physics.qpos[2]) & (physics.qpos[2] < high)

@@ -41,7 +41,9 @@ class HumanoidStandup(HumanoidBody):
 
     options: HumanoidStandupOptions
 
-    def evaluate(self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array):
+    def reward_and_termination(
+        self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array
+    ):
         options = self.options
         terms = {
             # Divided by the physics step, not by the environment's.

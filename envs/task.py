@@ -150,7 +150,7 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def derived_names(self) -> tuple[str, ...]:
-        """The `mjData` arrays that `observe` and `evaluate` read."""
+        """The `mjData` arrays that `observe` and `reward_and_termination` read."""
 
     @abc.abstractmethod
     def observation_blocks(self) -> dict[str, int]:
@@ -165,7 +165,7 @@ class Task(abc.ABC):
         return {}
 
     @abc.abstractmethod
-    def evaluate(
+    def reward_and_termination(
         self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array
     ) -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
         """Signed reward terms of a step, their sum as Gymnasium adds them up, and whether the episode ends."""
@@ -237,33 +237,35 @@ class Task(abc.ABC):
         physics, derived, overflow = self.engine.step(state.physics, action)
         memory = self.remember(physics, derived)
         obs = self.observe(physics, derived)
-        terms, reward, terminated = self.evaluate(state, physics, derived, memory, action)
+        terms, reward, terminated = self.reward_and_termination(state, physics, derived, memory, action)
         rewarded = RewardStep(terms, reward, state.physics, physics, obs, action, terminated, self.dt)
         terms, reward = self._own_reward(rewarded)
 
-        is_sound = _is_sound((physics.qpos, physics.qvel)) & _is_sound((physics.qacc_warmstart, obs, reward), jnp.inf)
+        is_finite = _is_finite((physics.qpos, physics.qvel)) & _is_finite(
+            (physics.qacc_warmstart, obs, reward), jnp.inf
+        )
         physics, memory, obs = jax.tree.map(
-            lambda new, old: jnp.where(is_sound, new, old),
+            lambda new, old: jnp.where(is_finite, new, old),
             (physics, memory, obs),
             (state.physics, state.memory, state.obs),
         )
         # A strong zero: weakly typed metrics would have every program compiled twice.
         zero = jnp.float32(0.0)
-        terms = {name: jnp.where(is_sound, value, zero) for name, value in terms.items()}
+        terms = {name: jnp.where(is_finite, value, zero) for name, value in terms.items()}
         steps = state.steps + 1
         return State(
             physics=physics,
             memory=memory,
             obs=obs,
-            reward=jnp.where(is_sound, reward, zero),
-            terminated=terminated | ~is_sound,
+            reward=jnp.where(is_finite, reward, zero),
+            terminated=terminated | ~is_finite,
             truncated=steps >= self.options.max_episode_steps,
             steps=steps,
-            metrics=terms | {"nonfinite": jnp.float32(~is_sound), "overflow": jnp.float32(overflow)},
+            metrics=terms | {"nonfinite": jnp.float32(~is_finite), "overflow": jnp.float32(overflow)},
         )
 
 
-def _is_sound(arrays, limit: float = MAX_ABS_VALUE) -> jax.Array:
+def _is_finite(arrays, limit: float = MAX_ABS_VALUE) -> jax.Array:
     return jnp.array([jnp.all(jnp.abs(x) < limit) for x in arrays]).all()
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_walk.envs import State, Task
-from mjx_walk.envs.inline_evaluation import LiveEvaluation, LiveEvaluator
+from mjx_walk.envs.inline_evaluation import InlineEvaluation, InlineEvaluator
 from mjx_walk.utils.types import Metrics
 
 
@@ -24,13 +24,13 @@ class VectorState(flax.struct.PyTreeNode):
     env: State
     """`[B, …]`."""
     sums: EpisodeSums
-    is_whole: jax.Array
+    started_at_reset: jax.Array
     """`[B] bool`: the current episode began at a reset, so its sums count."""
     pool: State
     """`[R, …]` fresh random resets."""
     pool_used: jax.Array
     """`[] i32`: starts handed out since the pool was renewed."""
-    live: LiveEvaluation
+    live: InlineEvaluation
     """The evaluation that rides along."""
 
 
@@ -47,7 +47,7 @@ class Outcome(NamedTuple):
 class VectorEnv:
     """`num_envs` copies of a task that learn, and the evaluator's, all stepped together."""
 
-    def __init__(self, task: Task, num_envs: int, evaluator: LiveEvaluator, stagger: bool = False):
+    def __init__(self, task: Task, num_envs: int, evaluator: InlineEvaluator, stagger: bool = False):
         """
         Args:
             task: the unbatched environment.
@@ -73,7 +73,7 @@ class VectorEnv:
         return VectorState(
             env=env,
             sums=EpisodeSums(zeros, dict.fromkeys(self.task.reward_terms, zeros)),
-            is_whole=env.steps == 0,
+            started_at_reset=env.steps == 0,
             pool=pool,
             pool_used=jnp.zeros((), jnp.int32),
             live=self.evaluator.init(policy_params, pool),
@@ -93,7 +93,7 @@ class VectorEnv:
             update: `[] i32`, the number of updates behind it.
 
         Returns:
-            The next state, and the scores of `LiveEvaluator.next_round`.
+            The next state, and the scores of `InlineEvaluator.next_round`.
         """
         pool = self._reset_many(key)
         live, scores = self.evaluator.next_round(state.live, policy_params, update, pool)
@@ -128,7 +128,7 @@ class VectorEnv:
         pool_used = state.pool_used + num_done
         reused = jnp.maximum(pool_used - self.num_envs, 0) - jnp.maximum(state.pool_used - self.num_envs, 0)
 
-        ended = jnp.float32(done & state.is_whole)
+        ended = jnp.float32(done & state.started_at_reset)
         stats = {
             "episodes": ended.sum(),
             "return": (ended * sums.reward).sum(),
@@ -142,13 +142,13 @@ class VectorEnv:
         next_state = state.replace(
             env=restarted,
             sums=jax.tree.map(lambda x: jnp.where(done, 0.0, x), sums),
-            is_whole=state.is_whole | done,
+            started_at_reset=state.started_at_reset | done,
             pool_used=pool_used,
             live=live,
         )
         return next_state, Outcome(env.obs, env.reward, env.terminated, env.truncated), stats
 
-    def _step_all(self, state: VectorState, action: jax.Array) -> tuple[State, LiveEvaluation]:
+    def _step_all(self, state: VectorState, action: jax.Array) -> tuple[State, InlineEvaluation]:
         """One physics call for the copies that learn and those that are evaluated."""
         copies = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), state.env, state.live.env)
         actions = jnp.concatenate([action, self.evaluator.act(state.live)])

@@ -51,7 +51,9 @@ class Walker2d(Task):
         qvel = jnp.clip(physics.qvel, -MAX_OBSERVED_VELOCITY, MAX_OBSERVED_VELOCITY)
         return jnp.concatenate([qpos, qvel])
 
-    def evaluate(self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array):
+    def reward_and_termination(
+        self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array
+    ):
         options = self.options
         height, angle = physics.qpos[1], physics.qpos[2]
         is_healthy = (options.healthy_z_range[0] < height) & (height < options.healthy_z_range[1])

@@ -15,7 +15,7 @@ from mjx_walk.algos import make_algorithm
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.evaluation.gymnasium_scores import Scores, score_in_gymnasium, score_in_sim
 from mjx_walk.runs import run_folder
-from mjx_walk.runs.config import Config, compile_cache_dir, load_config, read_config
+from mjx_walk.runs.config import Config, compile_cache_dir, load_config, present_key, read_config
 from mjx_walk.runs.loggers import require_wandb
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.policies import SavedPolicy, make_task
@@ -149,7 +149,7 @@ def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | 
 
 def _as_saved(config: Config, overrides: list[str]) -> Config:
     """A run's own configuration, with the settings that were given to resume it, unless those say which run it is."""
-    given = {override.partition("=")[0] for override in overrides}
+    given = {present_key(override.partition("=")[0]) for override in overrides}
     if not (config.resume and config.run_dir) or given & {"env", "algo", "recipe"}:
         return config
     saved = read_config(run_folder.open_existing(config.run_dir).config)

@@ -171,17 +171,17 @@ def step_speed(task: Task, num_envs: int, seconds: float) -> float:
 
 def training_speed(config: Config, algorithm: Algorithm, fused: bool, seconds: float) -> float:
     """Steps per second of the chunks that the loop runs, one after the other; nothing is logged or saved."""
-    chunk = make_chunk(algorithm, config.updates_per_chunk, fused)
+    chunk = make_chunk(algorithm, config.iterations_per_call, fused)
     state = make_init(algorithm)(jax.random.PRNGKey(0))
-    steps_per_chunk = algorithm.steps_per_update * config.updates_per_chunk
-    return profile.steps_per_second(lambda state: chunk(state)[0], state, steps_per_chunk, seconds)
+    steps_per_call = algorithm.steps_per_iteration * config.iterations_per_call
+    return profile.steps_per_second(lambda state: chunk(state)[0], state, steps_per_call, seconds)
 
 
 def _learning_at_once(config: Config, task: Task) -> Algorithm:
     """The algorithm, which fills no replay before it learns."""
     settings = config.algo
     if isinstance(settings, OffPolicyConfig):
-        settings = dataclasses.replace(settings, prefill_steps=0)
+        settings = dataclasses.replace(settings, learning_starts=0)
     return make_algorithm(task, config.num_envs, config.evaluation, settings)
 
 
@@ -189,11 +189,11 @@ def where_time_goes(
     config: Config, algorithm: Algorithm, fused: bool, physics_speed: float, seconds: float
 ) -> list[tuple[str, float, str]]:
     """Names, values and units: of one update, what collecting and learning take, and the least that each could."""
-    parts = profile.time_parts(algorithm, config.updates_per_chunk, fused, seconds)
+    parts = profile.time_parts(algorithm, config.iterations_per_call, fused, seconds)
     flops, peak = profile.learning_flops(algorithm), profile.matmul_speed(config.algo.network_dtype, seconds)
     return [
         ("an update: collecting", parts["collecting"] * 1e3, "ms"),
-        ("  of which physics alone would take", algorithm.steps_per_update / physics_speed * 1e3, "ms"),
+        ("  of which physics alone would take", algorithm.steps_per_iteration / physics_speed * 1e3, "ms"),
         ("an update: learning", parts["learning"] * 1e3, "ms"),
         ("  of which matrix products alone would take", flops / peak * 1e3, "ms"),
         (f"products of large matrices, {config.algo.network_dtype}", peak / 1e12, "TFLOP/s"),

@@ -14,26 +14,26 @@ TINY = (
     "evaluation.num_envs=2",
     "evaluation.gymnasium_episodes=0",
     "algo.unroll_length=8",
-    "algo.measured_steps=8",
+    "algo.normalizer_warmup_steps_per_env=8",
     "algo.num_minibatches=2",
     "algo.num_epochs=2",
-    "checkpoint.every_chunks=2",
+    "checkpoint.every_calls=2",
 )
 TINY_OFF_POLICY = (
     "env=walker2d",
     "env.max_episode_steps=30",
     "num_envs=8",
-    "updates_per_chunk=8",
+    "iterations_per_call=8",
     "evaluation.num_envs=2",
     "evaluation.gymnasium_episodes=0",
     "algo.unroll_length=1",
-    "algo.updates_per_step=2",
+    "algo.grad_updates_per_step=2",
     "algo.batch_size=16",
     "algo.replay_capacity=256",
-    "algo.prefill_steps=64",
+    "algo.learning_starts=64",
     "algo.policy_hidden_layer_sizes=[32,32]",
     "algo.critic_hidden_layer_sizes=[32,32]",
-    "checkpoint.every_chunks=2",
+    "checkpoint.every_calls=2",
 )
 TINY_CHUNK = 8 * 8
 """Environment steps of a chunk of either."""

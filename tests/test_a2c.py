@@ -19,7 +19,7 @@ GAUSSIAN = {"distribution": "normal", "policy_hidden_layer_sizes": (8,), "value_
 
 def collected(task, **changes):
     """Config, algorithm, state and batch after one `collect`."""
-    config = A2CConfig(unroll_length=STEPS, measured_steps=0, reward_scale=2.0, **GAUSSIAN, **changes)
+    config = A2CConfig(unroll_length=STEPS, normalizer_warmup_steps_per_env=0, reward_scale=2.0, **GAUSSIAN, **changes)
     algorithm = make_a2c(task, NUM_ENVS, EvaluationConfig(1), config)
     before = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
     return config, algorithm, *jax.jit(algorithm.collect)(before)
@@ -50,9 +50,9 @@ def test_losses(gae_lambda):
 
 
 def test_the_loss_is_the_sum_of_its_parts_and_rewards_entropy():
-    config, algorithm, state, batch = collected(RewardedAction(), entropy_cost=0.3)
+    config, algorithm, state, batch = collected(RewardedAction(), entropy_coef=0.3)
     _, metrics = jax.jit(algorithm.learn)(state, batch)
-    losses = metrics["policy_loss"] + config.value_cost * metrics["value_loss"] + metrics["mean_out_of_bounds"]
+    losses = metrics["policy_loss"] + config.value_loss_coef * metrics["value_loss"] + metrics["mean_out_of_bounds"]
     assert abs(float(metrics["entropy"])) > 0.1
     assert float(metrics["loss"]) == pytest.approx(float(losses - 0.3 * metrics["entropy"]), rel=1e-4)
 

@@ -33,7 +33,7 @@ def test_walker2d_walks_after_the_cpu_recipe(tmp_path, algo, least, changes):
 @pytest.mark.parametrize(("version", "physics"), [("v5", "jax"), ("v5", "warp"), ("v4", "warp")])
 @pytest.mark.parametrize("name", TASKS)
 def test_parity_of_all_versions(name, version, physics):
-    found = parity.check(name, version, physics, num_copies=48, num_steps=120)
+    found = parity.check(name, version, physics, num_envs=48, num_steps=120)
     assert found.is_within, "\n".join(map(str, found.errors))
 
 
@@ -47,7 +47,7 @@ def test_parity_where_new_memory_holds_no_zeros():
 
 OWN = {
     "ppo": ("algo.num_minibatches=4", "algo.num_epochs=2"),
-    "sac": ("algo.updates_per_step=1", "algo.batch_size=64", "algo.prefill_steps=256", "updates_per_chunk=1"),
+    "sac": ("algo.grad_updates_per_step=1", "algo.batch_size=64", "algo.learning_starts=256", "iterations_per_call=1"),
 }
 
 

@@ -18,7 +18,7 @@ from mjx_walk.utils.errors import UserError
 
 SMALL = (
     *("env=walker2d", "num_envs=8", "algo.unroll_length=8", "algo.num_minibatches=2"),
-    *("total_steps=512", "evaluation.num_envs=2", "evaluation.gymnasium_episodes=1", "updates_per_chunk=1"),
+    *("total_steps=512", "evaluation.num_envs=2", "evaluation.gymnasium_episodes=1", "iterations_per_call=1"),
 )
 
 
@@ -150,7 +150,7 @@ def test_compare_runs_what_is_missing_and_keeps_the_rest(tmp_path, monkeypatch, 
 
 @pytest.mark.slow
 def test_an_interrupted_comparison_goes_on(tmp_path):
-    arguments = ["algos=[a2c]", "seeds=1", "out=out", *SMALL, "checkpoint.every_chunks=1"]
+    arguments = ["algos=[a2c]", "seeds=1", "out=out", *SMALL, "checkpoint.every_calls=1"]
     arguments[arguments.index("total_steps=512")] = "total_steps=6400"
     full = [sys.executable, "-m", "mjx_walk.compare", *arguments]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

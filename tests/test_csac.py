@@ -12,7 +12,9 @@ from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import Transition
 
-CONFIG = CSACConfig(policy_hidden_layer_sizes=(16,), critic_hidden_layer_sizes=(16,), num_atoms=21, return_bound=2.0)
+CONFIG = CSACConfig(
+    policy_hidden_layer_sizes=(16,), critic_hidden_layer_sizes=(16,), num_atoms=21, normalized_return_max=2.0
+)
 
 
 def project_slowly(probs, positions, atoms):
@@ -77,5 +79,5 @@ def test_critic_loss_is_the_cross_entropy_to_the_lower_critics_future():
 
 
 def test_returns_need_a_bound():
-    with pytest.raises(UserError, match="return_bound=null: csac needs"):
-        make_csac(toy_tasks.ObservedReward(10), 4, EvaluationConfig(1), CSACConfig(return_bound=None))
+    with pytest.raises(UserError, match="normalized_return_max=null: csac needs"):
+        make_csac(toy_tasks.ObservedReward(10), 4, EvaluationConfig(1), CSACConfig(normalized_return_max=None))

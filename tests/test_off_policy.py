@@ -34,7 +34,13 @@ def told(task, num_updates, **changes):
         return 0.01 * obs
 
     learner = Learner(lambda key: jnp.zeros(1), lambda state: state, act, act, tell, tell)
-    settings = {"unroll_length": 2, "updates_per_step": 1, "batch_size": 64, "replay_capacity": 64, "prefill_steps": 0}
+    settings = {
+        "unroll_length": 2,
+        "grad_updates_per_step": 1,
+        "batch_size": 64,
+        "replay_capacity": 64,
+        "learning_starts": 0,
+    }
     config = OffPolicyConfig(**settings | changes)
     algorithm = make_off_policy(task, NUM_ENVS, EvaluationConfig(1), config, learner)
     state, rows = algorithm.init(jax.random.PRNGKey(0)), []
@@ -54,7 +60,7 @@ def test_learning_rates_follow_their_schedule(schedule, rates):
 
 def test_normalised_rewards_keep_the_largest_return_within_its_bound():
     """A reward of 1 at each step for 10 steps: the largest discounted return is more than the std of all."""
-    _, state, metrics = told(EndlessReward(10), 12, normalize_rewards=True, return_bound=0.5, reward_scale=2.0)
+    _, state, metrics = told(EndlessReward(10), 12, normalize_rewards=True, normalized_return_max=0.5, reward_scale=2.0)
     largest = float(state.return_scale.largest)
     assert largest == pytest.approx(sum(0.99**i for i in range(10)), rel=1e-5)
     assert metrics["scale"][-1] == pytest.approx(2.0 * 0.5 / largest, rel=1e-5)
@@ -64,7 +70,7 @@ def test_normalised_rewards_keep_the_largest_return_within_its_bound():
 
 def test_actions_are_random_until_the_replay_is_filled():
     """The policy acts 0 on this task."""
-    _, state, _ = told(EndlessReward(), 3, prefill_steps=2 * 2 * NUM_ENVS)
+    _, state, _ = told(EndlessReward(), 3, learning_starts=2 * 2 * NUM_ENVS)
     actions = np.asarray(state.replay.action[:6])
     assert (actions[:4] != 0.0).all() and len(np.unique(actions[:4])) == 4 * NUM_ENVS
     np.testing.assert_array_equal(actions[4:], 0.0)

@@ -22,7 +22,7 @@ from mjx_walk.experiments.peers import restore_device_put_replicated
 
 SMALL = PPOConfig(
     unroll_length=8,
-    measured_steps=0,
+    normalizer_warmup_steps_per_env=0,
     num_unrolls=1,
     num_minibatches=4,
     num_epochs=3,
@@ -49,7 +49,7 @@ def test_update_equals_brax(monkeypatch):
     The shuffle is fixed and the entropy bonus off, since the two draw their keys in another order. No episode
     is cut off in so few steps, which Brax masks and we bootstrap.
     """
-    config = dataclasses.replace(SMALL, entropy_cost=0.0, observation_clip=None, stagger_episodes=False)
+    config = dataclasses.replace(SMALL, entropy_coef=0.0, observation_clip=None, init_at_random_episode_step=False)
     task = make_env("walker2d", physics="c")
     algorithm = make_ppo(task, 32, EvaluationConfig(1), config)
     state, batch = jax.jit(algorithm.collect)(jax.jit(algorithm.init)(jax.random.PRNGKey(0)))
@@ -125,7 +125,7 @@ def test_small_batch_training_learns(physics):
 )
 def test_options_train(changes):
     task = make_env("walker2d", physics="c")
-    config = dataclasses.replace(SMALL, measured_steps=12, num_minibatches=2, **changes)
+    config = dataclasses.replace(SMALL, normalizer_warmup_steps_per_env=12, num_minibatches=2, **changes)
     algorithm = make_ppo(task, 8, EvaluationConfig(1), config)
     state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
     collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
@@ -161,7 +161,9 @@ def test_linear_schedule_has_its_own_horizon():
 @pytest.mark.parametrize(("task", "lost"), [(EndlessReward(2), 1.0), (ConstantReward(), 0.0)])
 def test_a_step_that_is_cut_off_is_paid_the_lost_value_and_one_that_terminates_is_not(task, lost):
     """Rewards are 1; the lost value is γ V(s') in the unscaled units of rewards."""
-    config = dataclasses.replace(SMALL, unroll_length=4, stagger_episodes=False, reward_scale=0.5, discount=0.9)
+    config = dataclasses.replace(
+        SMALL, unroll_length=4, init_at_random_episode_step=False, reward_scale=0.5, discount=0.9
+    )
     algorithm = make_ppo(task, 4, EvaluationConfig(1), config)
     state = algorithm.init(jax.random.PRNGKey(0))
     value_params = jax.tree.map(lambda x: x + 0.1, state.params.value)  # which are worth nothing at an observation of 0
@@ -200,7 +202,7 @@ def test_the_entropy_bonus_falls_and_rewards_are_normalised_by_what_was_seen_bef
         "reward_scale": 2.0,
         "normalize_rewards": True,
     }
-    schedule = {"entropy_cost": 0.5, "entropy_schedule": "linear", "schedule_steps": 2 * 4 * 4}
+    schedule = {"entropy_coef": 0.5, "entropy_schedule": "linear", "schedule_steps": 2 * 4 * 4}
     config = dataclasses.replace(SMALL, **settings, **schedule)
     algorithm = make_ppo(EndlessReward(), 4, EvaluationConfig(1), config)
     state, costs = algorithm.init(jax.random.PRNGKey(0)), []

@@ -25,9 +25,9 @@ OFF_POLICY = SMALL | {
     "critic_hidden_layer_sizes": (32, 32),
     "batch_size": 64,
     "unroll_length": 1,
-    "updates_per_step": 4,
+    "grad_updates_per_step": 4,
     "replay_capacity": 4096,
-    "prefill_steps": 128,
+    "learning_starts": 128,
     "tau": 0.05,
     "policy_learning_rate": 1e-3,
     "critic_learning_rate": 3e-3,
@@ -43,7 +43,7 @@ SETTINGS = {
         "learning_rate": 3e-3,
         # With normalised advantages a noiseless task never stops to shrink the policy's std.
         "normalize_advantages": False,
-        "entropy_cost": 1e-3,
+        "entropy_coef": 1e-3,
     },
     "a2c": SMALL
     | {
@@ -52,12 +52,12 @@ SETTINGS = {
         "learning_rate": 1e-2,
         "init_noise_std": 0.3,
         "normalize_advantages": False,
-        "entropy_cost": 1e-3,
+        "entropy_coef": 1e-3,
     },
-    "reinforce": SMALL | {"unroll_length": 8, "learning_rate": 1e-2, "entropy_cost": 1e-2},
+    "reinforce": SMALL | {"unroll_length": 8, "learning_rate": 1e-2, "entropy_coef": 1e-2},
     "sac": OFF_POLICY | {"init_alpha": 1e-3, "alpha_learning_rate": 1e-6},
     "csac": OFF_POLICY
-    | {"init_alpha": 1e-3, "alpha_learning_rate": 1e-6, "normalize_rewards": False, "return_bound": 3.0},
+    | {"init_alpha": 1e-3, "alpha_learning_rate": 1e-6, "normalize_rewards": False, "normalized_return_max": 3.0},
     "td3": DETERMINISTIC,
     "ddpg": DETERMINISTIC,
 }
@@ -196,16 +196,16 @@ def test_mountain_car_is_solved(name):
         "discount": 0.99,
         "reward_scale": 0.1,
         "unroll_length": 8,
-        "updates_per_step": 1,
+        "grad_updates_per_step": 1,
         "policy_delay": 1,
         "batch_size": 256,
         "replay_capacity": 200_000,
-        "prefill_steps": 20_000,
+        "learning_starts": 20_000,
         "noise_repeat": 20,
         "n_step": 10,
     }
     soft = {"init_alpha": 1.0, "alpha_learning_rate": 3e-4, "target_entropy": 0.0}
-    own = {"sac": soft, "csac": soft | {"return_bound": 10.0}}
+    own = {"sac": soft, "csac": soft | {"normalized_return_max": 10.0}}
     make, config_class = ALGORITHMS[name]
     config = config_class(**SETTINGS[name] | changes | own.get(name, {"max_exploration_noise": 1.0}))
     algorithm = make(toy_tasks.MountainCar(), 64, EvaluationConfig(8), config)

@@ -32,11 +32,11 @@ def run(tmp_path):
     return Recorder(config, task, algorithm, folder), algorithm, state, folder
 
 
-def with_best(algorithm, state, best_return, best_update):
+def with_best(algorithm, state, best_return, best_iteration):
     """A state whose evaluations found a policy with all parameters 7 to be the best."""
     best = jax.tree.map(lambda x: jnp.full_like(x, 7), algorithm.policy_params(state))
     live = state.env.live.replace(
-        best_policy_params=best, best_return=jnp.float32(best_return), best_update=jnp.int32(best_update)
+        best_policy_params=best, best_return=jnp.float32(best_return), best_iteration=jnp.int32(best_iteration)
     )
     return state.replace(env=state.env.replace(live=live)), best
 
@@ -57,7 +57,7 @@ def test_the_best_policy_is_saved_once_evaluated_and_not_again_while_it_stays(ru
     assert_same(params, algorithm.policy_params(state))  # none is known to be better yet
     assert facts["env_steps"] == 4
 
-    state, best = with_best(algorithm, state, best_return=3.0, best_update=5)
+    state, best = with_best(algorithm, state, best_return=3.0, best_iteration=5)
     recorder.save(state, env_steps=80, wall_seconds=2.0)
     recorder.wait()
     params, facts = kept(folder, algorithm, state)
@@ -75,7 +75,7 @@ def test_the_best_policy_is_saved_once_evaluated_and_not_again_while_it_stays(ru
 def test_of_the_last_policy_and_the_best_one_gymnasium_chooses(run, monkeypatch, last, best, env_steps):
     """The last one's score is below the other's 10 in the evaluations beside training, so that both are scored."""
     recorder, algorithm, state, folder = run
-    state, best_params = with_best(algorithm, state, best_return=10.0, best_update=5)
+    state, best_params = with_best(algorithm, state, best_return=10.0, best_iteration=5)
     last_params = algorithm.policy_params(state)
 
     def score(params, num_episodes):

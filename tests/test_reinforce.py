@@ -14,9 +14,9 @@ NUM_ENVS, STEPS, LEARNED = 16, 6, 4
 # What follows the piece counts 0.5³ at the fourth step and 0.5² at the fifth.
 SETTINGS = {
     "unroll_length": STEPS,
-    "measured_steps": 0,
+    "normalizer_warmup_steps_per_env": 0,
     "discount": 0.5,
-    "max_unseen": 0.2,
+    "max_tail_discount": 0.2,
     "baseline": "mean",
     "policy_hidden_layer_sizes": (8,),
 }
@@ -32,7 +32,7 @@ def learned(task, **changes):
 
 def test_loss_over_the_steps_whose_future_was_seen():
     """Episodes that end at a piece's last steps are no reason to learn from these."""
-    config, state, batch, metrics = learned(DelayedReward(), stagger_episodes=False)
+    config, state, batch, metrics = learned(DelayedReward(), init_at_random_episode_step=False)
     steps, nets = batch.transitions, networks.make_ppo_networks(DelayedReward(), config)
     assert (np.asarray(steps.discount)[:, LEARNED:] == 0.0).any()
     obs = np.asarray(steps.observation)[:, :LEARNED]

@@ -90,7 +90,7 @@ def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
 def test_policy_gradient_resume_is_exact(tmp_path, algo):
     settings = [
         f"algo={algo}",
-        "updates_per_chunk=1",
+        "iterations_per_call=1",
         "algo.ou_noise_std=0.1" if algo == "a2c" else "algo.discount=0.5",
     ]
     tiny = [setting for setting in TINY if "num_epochs" not in setting]

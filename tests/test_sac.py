@@ -29,10 +29,10 @@ def test_update_equals_brax(monkeypatch):
     """
     config = SACConfig(
         unroll_length=1,
-        updates_per_step=UPDATES,
+        grad_updates_per_step=UPDATES,
         batch_size=BATCH,
         replay_capacity=256,
-        prefill_steps=0,
+        learning_starts=0,
         policy_learning_rate=1e-3,
         critic_learning_rate=1e-3,
         reward_scale=2.0,

@@ -35,8 +35,8 @@ def moved(run_dir):
     ("algo", "tiny"), [("ppo", TINY), pytest.param("sac", TINY_OFF_POLICY, marks=pytest.mark.slow)]
 )
 def test_seeds_side_by_side_are_the_runs_of_each(tmp_path, algo, tiny):
-    settings = [f"algo={algo}", f"total_steps={2 * TINY_CHUNK}", "checkpoint.every_chunks=1"]
-    tiny = [setting for setting in tiny if "every_chunks" not in setting]
+    settings = [f"algo={algo}", f"total_steps={2 * TINY_CHUNK}", "checkpoint.every_calls=1"]
+    tiny = [setting for setting in tiny if "every_calls" not in setting]
     train_here(tmp_path / "both", *settings, SEEDS, tiny=tiny)
     train_here(tmp_path / "alone", *settings, "seed=5", tiny=tiny)
     assert_alike(leaves(tmp_path / "both" / "seed_5", 2), leaves(tmp_path / "alone", 2), exactly=False)

@@ -50,9 +50,13 @@ def assert_close(tree, other):
 
 
 def test_two_devices_learn_what_one_learns_from_both_batches():
-    settings = {"num_unrolls": 1, "num_minibatches": 1, "num_epochs": 3, "entropy_cost": 0.0}
+    settings = {"num_unrolls": 1, "num_minibatches": 1, "num_epochs": 3, "entropy_coef": 0.0}
     config = PPOConfig(
-        unroll_length=4, measured_steps=0, normalize_advantages=False, normalize_rewards=True, **settings
+        unroll_length=4,
+        normalizer_warmup_steps_per_env=0,
+        normalize_advantages=False,
+        normalize_rewards=True,
+        **settings,
     )
     algorithm = make_ppo(ObservedReward(), 16, EvaluationConfig(1), config)
     state, batch = jax.jit(algorithm.collect)(algorithm.init(KEY))
@@ -71,8 +75,8 @@ def test_two_devices_learn_what_one_learns_from_both_batches():
 
 
 def test_each_device_counts_its_own_share_of_the_steps():
-    part = per_device(OffPolicyConfig(schedule_steps=101, prefill_steps=8, batch_size=64), 2)
-    assert (part.schedule_steps, part.prefill_steps, part.batch_size) == (51, 4, 64)
+    part = per_device(OffPolicyConfig(schedule_steps=101, learning_starts=8, batch_size=64), 2)
+    assert (part.schedule_steps, part.learning_starts, part.batch_size) == (51, 4, 64)
 
 
 def test_running_statistics_are_of_all_devices():
@@ -112,7 +116,7 @@ def test_a_checkpoint_of_another_run_is_refused_not_passed_over(tmp_path):
 
 
 def run(run_dir, *arguments, tiny=TINY, devices=2):
-    done = command("train", *tiny, f"run_dir={run_dir}", f"devices={devices}", "checkpoint.every_chunks=1", *arguments)
+    done = command("train", *tiny, f"run_dir={run_dir}", f"devices={devices}", "checkpoint.every_calls=1", *arguments)
     assert done.returncode == 0, done.stdout + done.stderr
     return done
 
@@ -173,7 +177,7 @@ def wait_until(is_so):
 @pytest.mark.slow
 def test_a_process_that_dies_ends_the_run_which_goes_on_from_its_checkpoint(tmp_path):
     settings = [f"run_dir={tmp_path}/run", "devices=2"]
-    parent = start(*settings, "checkpoint.every_chunks=1", f"total_steps={60 * CHUNK}")
+    parent = start(*settings, "checkpoint.every_calls=1", f"total_steps={60 * CHUNK}")
     second = tmp_path / "run" / "checkpoints" / "device_1"
     wait_until(lambda: len(list(second.glob("0*"))) >= 2)
     children = subprocess.run(["pgrep", "-P", str(parent.pid)], capture_output=True, text=True, check=True)

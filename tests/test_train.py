@@ -217,7 +217,7 @@ def test_a_reward_that_is_not_finite_is_told_once(tmp_path, monkeypatch, capsys)
 
 def test_training_that_diverges_stops_and_keeps_what_was_saved_before(tmp_path):
     run, steps = tmp_path / "run", f"total_steps={50 * TINY_CHUNK}"
-    arguments = [*TINY, f"run_dir={run}", "checkpoint.every_chunks=1", steps]
+    arguments = [*TINY, f"run_dir={run}", "checkpoint.every_calls=1", steps]
     with pytest.raises(UserError, match=r"training has diverged: .* the policy of seed 0 is not finite"):
         train_command.main([*arguments, "algo.learning_rate=1e30"])
     assert 1 <= len((run / "metrics.jsonl").read_text().splitlines()) <= 3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_walk.envs import make_env
-from mjx_walk.envs.inline_evaluation import EvaluationConfig, LiveEvaluator
+from mjx_walk.envs.inline_evaluation import EvaluationConfig, InlineEvaluator
 from mjx_walk.envs.vector_env import VectorEnv
 
 
@@ -16,7 +16,9 @@ def still(task):
 
 
 def make_vector(task, num_envs, num_eval_envs=2, **kwargs):
-    evaluator = LiveEvaluator(task, num_envs, EvaluationConfig(num_eval_envs), still(task), steps_per_update=num_envs)
+    evaluator = InlineEvaluator(
+        task, num_envs, EvaluationConfig(num_eval_envs), still(task), steps_per_iteration=num_envs
+    )
     return VectorEnv(task, num_envs, evaluator, **kwargs)
 
 
@@ -90,7 +92,7 @@ def test_staggered_first_episodes_are_not_counted(walker):
 
 def test_a_round_of_evaluation_is_not_begun_too_early(walker):
     config = EvaluationConfig(2, every_steps=100)
-    env = VectorEnv(walker, 4, LiveEvaluator(walker, 4, config, still(walker), steps_per_update=8))
+    env = VectorEnv(walker, 4, InlineEvaluator(walker, 4, config, still(walker), steps_per_iteration=8))
     state = env.init(jax.random.PRNGKey(0), ())
     state = state.replace(live=state.live.replace(alive=jnp.zeros(2, bool)))
     for update, is_told in ((11, False), (12, False), (13, True)):
@@ -118,19 +120,19 @@ def test_live_evaluation_equals_an_evaluation_on_its_own(walker):
     assert not state.live.alive.any()
     np.testing.assert_allclose(state.live.returns, expected, rtol=1e-5)
     state, scores = env.renew(state, jax.random.PRNGKey(1), (), jnp.int32(7))
-    assert scores["eval_return"] == pytest.approx(np.mean(expected), rel=1e-5) and scores["eval_update"] == 0
-    assert state.live.best_return == scores["eval_return"] and state.live.snapshot_update == 7
+    assert scores["eval_return"] == pytest.approx(np.mean(expected), rel=1e-5) and scores["eval_iteration"] == 0
+    assert state.live.best_return == scores["eval_return"] and state.live.snapshot_iteration == 7
     assert state.live.alive.all()
     _, unfinished = env.renew(state, jax.random.PRNGKey(2), (), jnp.int32(8))
     assert np.isnan(unfinished["eval_return"])
 
 
 def test_the_best_policy_is_the_one_that_was_scored_best(walker):
-    evaluator = LiveEvaluator(walker, 2, EvaluationConfig(2), still(walker), steps_per_update=1)
+    evaluator = InlineEvaluator(walker, 2, EvaluationConfig(2), still(walker), steps_per_iteration=1)
     starts = jax.vmap(walker.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
     live = evaluator.init(jnp.float32(0.0), starts)
     for update, score in enumerate((1.0, 3.0, 2.0), start=1):
         live = live.replace(alive=jnp.zeros(2, bool), returns=jnp.full(2, score))
         live, _ = evaluator.next_round(live, jnp.float32(update), jnp.int32(update), starts)
     # The second round's is the one that was the present policy when the first one ended.
-    assert (float(live.best_policy_params), int(live.best_update), float(live.best_return)) == (1.0, 1, 3.0)
+    assert (float(live.best_policy_params), int(live.best_iteration), float(live.best_return)) == (1.0, 1, 3.0)

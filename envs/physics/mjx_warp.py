@@ -13,14 +13,14 @@ from mjx_walk.envs.physics import capsule_frames_warp
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
 
-CONTACTS_PER_COPY = 40
+CONTACTS_PER_ENV = 40
 """Room for geom pairs that may touch, and then for contacts, of a copy on average; the batch shares both buffers.
 
 Measured, highest mean over a batch: 20.7 pairs and 10.0 contacts (HumanoidStandup on the floor under random actions),
 7.3 contacts under trained policies."""
 SPARE_CONTACTS = 256
 """Room on top, so that a small batch, whose mean swings further, does not overflow."""
-CONSTRAINTS_PER_COPY = 112
+CONSTRAINTS_PER_ENV = 112
 """Constraint rows of any one copy: four for a contact with friction, one for any other and for a joint limit.
 
 Measured: at most 49 under random actions, 31 under trained policies."""
@@ -52,14 +52,14 @@ class WarpEngine:
 
     def _data(self, state: PhysicsState) -> mjx.Data:
         """Warp's work space for the whole batch, made inside the program: nearly all zeros, never a constant."""
-        num_copies = state.qpos.shape[0]
+        num_envs = state.qpos.shape[0]
         with jax.ensure_compile_time_eval():
             blank = mjx.make_data(
                 self._mj_model,
                 impl="warp",
                 device=jax.local_devices()[0],
-                naconmax=CONTACTS_PER_COPY * num_copies + SPARE_CONTACTS,
-                njmax=CONSTRAINTS_PER_COPY,
+                naconmax=CONTACTS_PER_ENV * num_envs + SPARE_CONTACTS,
+                njmax=CONSTRAINTS_PER_ENV,
             )
             blank = jax.tree.map(np.asarray, blank)
         blank = jax.tree.map(lambda x: jnp.array(x) if x.any() else jnp.zeros(x.shape, x.dtype), blank)

@@ -44,9 +44,9 @@ class CEngine:
         next_state, derived, overflow = jax.pure_callback(self._host_step, result, *state, ctrl)
         return PhysicsState(*next_state), derived, overflow
 
-    def _result_shapes(self, num_copies: int):
+    def _result_shapes(self, num_envs: int):
         def array(*shape, dtype=np.float32):
-            return jax.ShapeDtypeStruct((num_copies, *shape), dtype)
+            return jax.ShapeDtypeStruct((num_envs, *shape), dtype)
 
         state = (array(self._model.nq), array(self._model.nv), array(self._model.nv))
         return state, {name: array(*shape) for name, shape in self._shapes.items()}, array(dtype=np.bool_)
@@ -86,16 +86,16 @@ class CEngine:
         self._for_each_copy(len(qpos), one)
         return state, derived, np.zeros(len(qpos), np.bool_)
 
-    def _empty_derived(self, num_copies: int) -> dict[str, np.ndarray]:
-        return {name: np.empty((num_copies, *shape), np.float32) for name, shape in self._shapes.items()}
+    def _empty_derived(self, num_envs: int) -> dict[str, np.ndarray]:
+        return {name: np.empty((num_envs, *shape), np.float32) for name, shape in self._shapes.items()}
 
     def _store(self, data: mujoco.MjData, derived: dict[str, np.ndarray], i: int) -> None:
         for name, target in derived.items():
             target[i] = getattr(data, name)
 
-    def _for_each_copy(self, num_copies: int, one) -> None:
-        num_tasks = max(1, min(self._num_threads, num_copies // _MIN_COPIES_PER_TASK))
-        bounds = np.linspace(0, num_copies, num_tasks + 1).astype(int)
+    def _for_each_copy(self, num_envs: int, one) -> None:
+        num_tasks = max(1, min(self._num_threads, num_envs // _MIN_COPIES_PER_TASK))
+        bounds = np.linspace(0, num_envs, num_tasks + 1).astype(int)
 
         def run(task: int) -> None:
             for i in range(bounds[task], bounds[task + 1]):

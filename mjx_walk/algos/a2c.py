@@ -47,7 +47,7 @@ def make_a2c(task: Task, num_envs: int, evaluation: EvaluationConfig, config: A2
     def value_loss(params, normalizer, samples: Samples) -> tuple[jax.Array, Metrics]:
         values = value_network.apply(normalizer, params.value, samples.observation)
         loss = jnp.square(samples.target - values).mean()
-        return config.value_cost * loss, {"value_loss": loss}
+        return config.value_loss_coef * loss, {"value_loss": loss}
 
     def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         """Source: Mnih et al. 2016, algorithm S3, with generalised advantages."""

@@ -31,9 +31,9 @@ class CSACConfig(SACConfig):
 
     name: str = setting("csac", choices=("csac",))
     num_atoms: int = setting(101, at_least=2)
-    """Returns that the critics tell apart, evenly spaced from `-return_bound` to `return_bound`."""
+    """Returns that the critics tell apart, evenly spaced from `-normalized_return_max` to `normalized_return_max`."""
     normalize_rewards: bool = True
-    return_bound: float | None = setting(5.0, above=0)
+    normalized_return_max: float | None = setting(5.0, above=0)
 
 
 def make_csac(task: Task, num_envs: int, evaluation: EvaluationConfig, config: CSACConfig) -> Algorithm:
@@ -51,9 +51,9 @@ def make_csac_networks(task: Task, config: CSACConfig) -> tuple[SACNetworks, Dis
     Raises:
         UserError: the returns have no bound.
     """
-    if config.return_bound is None:
-        raise UserError("algo.return_bound=null: csac needs the bound of the returns that its critics tell apart")
-    atoms = jnp.linspace(-config.return_bound, config.return_bound, config.num_atoms)
+    if config.normalized_return_max is None:
+        raise UserError("algo.normalized_return_max=null: csac needs a bound, the range of its atoms")
+    atoms = jnp.linspace(-config.normalized_return_max, config.normalized_return_max, config.num_atoms)
     critics = networks.make_critics(2, config.num_atoms, task, config)
 
     def log_distributions(params: Any, obs: jax.Array, action: jax.Array) -> jax.Array:

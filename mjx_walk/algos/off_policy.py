@@ -15,7 +15,7 @@ from mjx_walk.common import networks, returns, rollout
 from mjx_walk.common.replay_buffer import Replay, ReplayBuffer, Steps
 from mjx_walk.common.schedules import anneal, anneal_discount, factor
 from mjx_walk.envs import Task
-from mjx_walk.envs.inline_evaluation import EvaluationConfig, LiveEvaluator
+from mjx_walk.envs.inline_evaluation import EvaluationConfig, InlineEvaluator
 from mjx_walk.envs.vector_env import VectorEnv, VectorState
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
@@ -28,7 +28,7 @@ class OffPolicyConfig:
 
     unroll_length: int = setting(4, at_least=1)
     """Steps of all copies between two phases of learning."""
-    updates_per_step: int = setting(8, at_least=1)
+    grad_updates_per_step: int = setting(8, at_least=1)
     """Critic updates for each step of all copies."""
     policy_delay: int = setting(1, at_least=1)
     """Critic updates for each policy update."""
@@ -37,7 +37,7 @@ class OffPolicyConfig:
     """Transitions, rounded up to whole unrolls."""
     replay_dtype: str = setting("float32", choices=("float32", "bfloat16"))
     """Of the observations stored."""
-    prefill_steps: int = setting(10_000, at_least=0)
+    learning_starts: int = setting(10_000, at_least=0)
     """Environment steps under uniformly random actions, before learning begins."""
     noise_repeat: int = setting(1, at_least=1)
     """Steps that the same draw of exploration noise is kept for."""
@@ -57,7 +57,7 @@ class OffPolicyConfig:
     reward_scale: float = setting(1.0, above=0)
     normalize_rewards: bool = False
     """Divide rewards by the running std of the discounted return, before `reward_scale`."""
-    return_bound: float | None = setting(None, above=0)
+    normalized_return_max: float | None = setting(None, above=0)
     """Divide them by more, if it takes that to keep every discounted return seen within this."""
     normalize_observations: bool = True
     observation_clip: float | None = setting(10.0, above=0)
@@ -69,7 +69,7 @@ class OffPolicyConfig:
     activation: str = setting("relu", choices=tuple(ACTIVATION))
     network_dtype: str = setting("float32", choices=("float32", "bfloat16"))
     """That the networks compute in. Parameters, losses and optimizers are float32."""
-    stagger_episodes: bool = True
+    init_at_random_episode_step: bool = True
 
 
 class Batch(NamedTuple):
@@ -114,7 +114,7 @@ class OffPolicyState(flax.struct.PyTreeNode):
     noise_key: jax.Array
     """From which the exploration noise of every step follows."""
     key: jax.Array
-    updates: jax.Array
+    iterations: jax.Array
     """`[] i32`: unrolls done."""
 
 
@@ -133,20 +133,22 @@ def make_off_policy(
     Raises:
         UserError: settings that do not go together.
     """
-    updates_per_unroll = config.updates_per_step * config.unroll_length
+    updates_per_unroll = config.grad_updates_per_step * config.unroll_length
     if updates_per_unroll % config.policy_delay:
         raise UserError(
-            f"algo.updates_per_step={config.updates_per_step} times algo.unroll_length={config.unroll_length} does not "
-            f"divide into algo.policy_delay={config.policy_delay}"
+            f"algo.grad_updates_per_step={config.grad_updates_per_step} times "
+            f"algo.unroll_length={config.unroll_length} must be a multiple of algo.policy_delay={config.policy_delay}"
         )
-    steps_per_update = num_envs * config.unroll_length
-    unrolls_kept = max(-(-config.replay_capacity // steps_per_update), -(-(config.n_step + 1) // config.unroll_length))
+    steps_per_iteration = num_envs * config.unroll_length
+    unrolls_kept = max(
+        -(-config.replay_capacity // steps_per_iteration), -(-(config.n_step + 1) // config.unroll_length)
+    )
     buffer = ReplayBuffer(task, num_envs, unrolls_kept * config.unroll_length, config.replay_dtype)
-    if config.prefill_steps > buffer.num_transitions:
+    if config.learning_starts > buffer.num_transitions:
         raise UserError(
-            f"algo.prefill_steps={config.prefill_steps} is more than algo.replay_capacity={config.replay_capacity}"
+            f"algo.learning_starts={config.learning_starts} is more than algo.replay_capacity={config.replay_capacity}"
         )
-    rows_before_learning = max(-(-config.prefill_steps // num_envs), config.n_step + 1)
+    rows_before_learning = max(-(-config.learning_starts // num_envs), config.n_step + 1)
 
     def normalize(normalizer: RunningStatisticsState, obs: jax.Array) -> jax.Array:
         return running_statistics.normalize(obs, normalizer, max_abs_value=config.observation_clip)
@@ -162,8 +164,8 @@ def make_off_policy(
     def policy_params(state: OffPolicyState) -> Any:
         return (state.normalizer, learner.policy_params(state.learner))
 
-    evaluator = LiveEvaluator(task, num_envs, evaluation, policy, steps_per_update)
-    env = VectorEnv(task, num_envs, evaluator, config.stagger_episodes)
+    evaluator = InlineEvaluator(task, num_envs, evaluation, policy, steps_per_iteration)
+    env = VectorEnv(task, num_envs, evaluator, config.init_at_random_episode_step)
 
     def init(key: jax.Array) -> OffPolicyState:
         learner_key, env_key, noise_key, key = jax.random.split(key, 4)
@@ -178,14 +180,14 @@ def make_off_policy(
             env=env.init(env_key, (normalizer, learner.policy_params(learner_state))),
             noise_key=noise_key,
             key=key,
-            updates=jnp.zeros((), jnp.int32),
+            iterations=jnp.zeros((), jnp.int32),
         )
 
     def collect(state: OffPolicyState) -> tuple[OffPolicyState, tuple[Steps, Metrics]]:
         key, pool_key = jax.random.split(state.key)
-        step = state.updates * config.unroll_length + jnp.arange(config.unroll_length)
+        step = state.iterations * config.unroll_length + jnp.arange(config.unroll_length)
         noise_keys = jax.vmap(jax.random.fold_in, (None, 0))(state.noise_key, step // config.noise_repeat)
-        is_random = state.updates * float(steps_per_update) < config.prefill_steps
+        is_random = state.iterations * float(steps_per_iteration) < config.learning_starts
         params = learner.policy_params(state.learner)
 
         def actor(obs, key):
@@ -199,7 +201,7 @@ def make_off_policy(
             outcome = step.outcome
             return Steps(step.obs, step.extras, outcome.reward, outcome.terminated, outcome.truncated, outcome.obs)
 
-        env_state, scores = env.renew(state.env, pool_key, policy_params(state), state.updates)
+        env_state, scores = env.renew(state.env, pool_key, policy_params(state), state.iterations)
         env_state, steps, stats = rollout.unroll(env, env_state, actor, noise_keys, keep)
         return state.replace(env=env_state, key=key), (steps, stats | scores)
 
@@ -209,13 +211,13 @@ def make_off_policy(
         normalizer = state.normalizer
         if config.normalize_observations:
             normalizer = networks.update_normalizer(normalizer, steps.observation)
-        remaining = anneal(state.updates * float(steps_per_update), config.schedule_steps)
+        remaining = anneal(state.iterations * float(steps_per_iteration), config.schedule_steps)
         discount = anneal_discount(config.discount, config.final_discount, remaining)
         ended = steps.terminated | steps.truncated
         return_scale = returns.update_return_scale(state.return_scale, steps.reward, ended, discount)
         reward_scale = jnp.float32(config.reward_scale)
         if config.normalize_rewards:
-            reward_scale *= returns.reward_multiplier(return_scale, config.return_bound)
+            reward_scale *= returns.reward_multiplier(return_scale, config.normalized_return_max)
         rate_factor = factor(config.learning_rate_schedule, remaining)
         replay = buffer.insert(state.replay, steps)
 
@@ -260,7 +262,7 @@ def make_off_policy(
             return_scale=return_scale,
             replay=replay,
             key=key,
-            updates=state.updates + 1,
+            iterations=state.iterations + 1,
         )
         return new_state, stats | metrics | {
             "critic_updates": jnp.float32(new_state.critic_updates),
@@ -268,4 +270,4 @@ def make_off_policy(
             "reward_scale": reward_scale,
         }
 
-    return Algorithm(init, collect, learn, policy_params, policy, steps_per_update, replay_bytes=buffer.num_bytes)
+    return Algorithm(init, collect, learn, policy_params, policy, steps_per_iteration, replay_bytes=buffer.num_bytes)

@@ -19,7 +19,7 @@ from mjx_walk.common.exploration import OrnsteinUhlenbeck
 from mjx_walk.common.optimizers import make_adam
 from mjx_walk.common.schedules import anneal
 from mjx_walk.envs import Task
-from mjx_walk.envs.inline_evaluation import EvaluationConfig, LiveEvaluator
+from mjx_walk.envs.inline_evaluation import EvaluationConfig, InlineEvaluator
 from mjx_walk.envs.vector_env import VectorEnv, VectorState
 from mjx_walk.utils.settings import setting
 from mjx_walk.utils.types import Metrics, PolicyFn, Transition
@@ -33,7 +33,7 @@ class OnPolicyConfig:
     """Steps of one trajectory piece, over which advantages are estimated."""
     num_unrolls: int = setting(4, at_least=1)
     """Pieces of every copy in one batch."""
-    measured_steps: int = setting(16, at_least=0)
+    normalizer_warmup_steps_per_env: int = setting(16, at_least=0)
     """Of each copy, at the start: batches of these only tell the scale of observations and rewards. Ten are too few on
     Humanoid, which falls in 24 under random actions: scaled by the first ten, the positions of the next ten are two
     standard deviations away, and learning starts with a KL of 3 to 13."""
@@ -49,10 +49,10 @@ class OnPolicyConfig:
     """Unset, `max_policy_grad_norm` clips policy and value together, as Brax does."""
     discount: float = setting(0.97, at_least=0, at_most=1)
     gae_lambda: float = setting(0.95, at_least=0, at_most=1)
-    entropy_cost: float = setting(1e-3, at_least=0)
+    entropy_coef: float = setting(1e-3, at_least=0)
     entropy_schedule: str = setting("constant", choices=("constant", "linear"))
     """`linear`: to zero over `schedule_steps`."""
-    value_cost: float = setting(0.5, above=0)
+    value_loss_coef: float = setting(0.5, above=0)
     """Of the squared error; PPO's loss, which is Brax's, halves it once more."""
     reward_scale: float = setting(0.1, above=0)
     normalize_rewards: bool = False
@@ -73,7 +73,7 @@ class OnPolicyConfig:
     min_log_std: float = setting(-20.0, at_least=-80, at_most=80)
     max_log_std: float = setting(2.0, at_least=-80, at_most=80)
     """The same as `min_log_std` for a std that does not learn."""
-    stagger_episodes: bool = True
+    init_at_random_episode_step: bool = True
 
 
 class OnPolicyState(flax.struct.PyTreeNode):
@@ -89,7 +89,7 @@ class OnPolicyState(flax.struct.PyTreeNode):
     noise: jax.Array | tuple[()]
     """Of exploration, where it is correlated in time, `[B, action_size]`."""
     key: jax.Array
-    updates: jax.Array
+    iterations: jax.Array
     """`[] i32`: updates done."""
 
 
@@ -112,13 +112,13 @@ class OnPolicyGround(NamedTuple):
 
     nets: brax_ppo_networks.PPONetworks
     optimizer: optax.GradientTransformation
-    """Without the learning rate; see `optimizers.descend`."""
+    """Without the learning rate; see `optimizers.apply_gradients`."""
     init: Callable[[jax.Array], OnPolicyState]
     collect: Callable[[OnPolicyState], tuple[OnPolicyState, OnPolicyBatch]]
     policy_params: Callable[[OnPolicyState], Any]
     policy: Callable[..., PolicyFn]
-    steps_per_update: int
-    num_measured_batches: int
+    steps_per_iteration: int
+    num_warmup_batches: int
     """The first ones, which give the scale of observations and rewards and are not learned from."""
     remaining: Callable[[OnPolicyState], jax.Array]
     """The share of the schedules that is left."""
@@ -152,9 +152,9 @@ def make_on_policy(
     def policy_params(state: OnPolicyState) -> Any:
         return (state.normalizer, state.params.policy)
 
-    steps_per_update = num_envs * config.unroll_length * config.num_unrolls
-    evaluator = LiveEvaluator(task, num_envs, evaluation, policy, steps_per_update)
-    env = VectorEnv(task, num_envs, evaluator, config.stagger_episodes)
+    steps_per_iteration = num_envs * config.unroll_length * config.num_unrolls
+    evaluator = InlineEvaluator(task, num_envs, evaluation, policy, steps_per_iteration)
+    env = VectorEnv(task, num_envs, evaluator, config.init_at_random_episode_step)
     optimizer = _make_optimizer(config)
 
     def init(key: jax.Array) -> OnPolicyState:
@@ -173,7 +173,7 @@ def make_on_policy(
             env=env.init(env_key, (normalizer, params.policy)),
             noise=exploration.init(num_envs, task.action_size) if exploration else (),
             key=key,
-            updates=jnp.zeros((), jnp.int32),
+            iterations=jnp.zeros((), jnp.int32),
         )
 
     def collect(state: OnPolicyState) -> tuple[OnPolicyState, OnPolicyBatch]:
@@ -226,7 +226,7 @@ def make_on_policy(
             env_state, kept, stats = rollout.unroll(env, env_state, actor, (keys, noises), keep)
             return (env_state, noise), (*kept, env_state.env.obs, stats)
 
-        env_state, scores = env.renew(state.env, pool_key, policy_params(state), state.updates)
+        env_state, scores = env.renew(state.env, pool_key, policy_params(state), state.iterations)
         keys = jax.random.split(run_key, config.num_unrolls)
         carry = (env_state, state.noise)
         (env_state, noise), (transitions, reward, done, last_obs, stats) = jax.lax.scan(piece, carry, keys)
@@ -243,7 +243,7 @@ def make_on_policy(
         return state.replace(env=env_state, noise=noise, key=key), batch
 
     def remaining(state: OnPolicyState) -> jax.Array:
-        return anneal(state.updates * float(steps_per_update), config.schedule_steps)
+        return anneal(state.iterations * float(steps_per_iteration), config.schedule_steps)
 
     return OnPolicyGround(
         nets,
@@ -252,8 +252,8 @@ def make_on_policy(
         collect,
         policy_params,
         policy,
-        steps_per_update,
-        math.ceil(config.measured_steps / (config.unroll_length * config.num_unrolls)),
+        steps_per_iteration,
+        math.ceil(config.normalizer_warmup_steps_per_env / (config.unroll_length * config.num_unrolls)),
         remaining,
     )
 

@@ -28,7 +28,7 @@ def make_algorithm(ground: OnPolicyGround, learn: Learn) -> Algorithm:
 
     def learn_once_measured(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         learned, metrics = learn(state, batch)
-        is_measuring = state.updates < ground.num_measured_batches
+        is_measuring = state.iterations < ground.num_warmup_batches
         old = (state.params, state.optimizer, state.learning_rate)
         new = (learned.params, learned.optimizer, learned.learning_rate)
         kept = jax.tree.map(lambda old, new: jnp.where(is_measuring, old, new), old, new)
@@ -38,7 +38,12 @@ def make_algorithm(ground: OnPolicyGround, learn: Learn) -> Algorithm:
         return learned.replace(params=kept[0], optimizer=kept[1], learning_rate=kept[2]), metrics
 
     return Algorithm(
-        ground.init, ground.collect, learn_once_measured, ground.policy_params, ground.policy, ground.steps_per_update
+        ground.init,
+        ground.collect,
+        learn_once_measured,
+        ground.policy_params,
+        ground.policy,
+        ground.steps_per_iteration,
     )
 
 
@@ -69,7 +74,7 @@ def after_update(
         normalizer=normalizer,
         return_scale=returns.update_return_scale(state.return_scale, batch.rewards, batch.ended, config.discount),
         key=key,
-        updates=state.updates + 1,
+        iterations=state.iterations + 1,
     )
 
 

@@ -12,7 +12,7 @@ from brax.training.acme.running_statistics import RunningStatisticsState
 from mjx_walk.algos.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyGround, OnPolicyState
 from mjx_walk.algos.on_policy_update import after_update, learning_rates, require_several_gradient_steps
 from mjx_walk.common import networks
-from mjx_walk.common.optimizers import descend
+from mjx_walk.common.optimizers import apply_gradients
 from mjx_walk.common.schedules import factor
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
@@ -25,7 +25,7 @@ class PolicyGradientConfig(OnPolicyConfig):
 
     distribution: str = setting("normal", choices=("tanh_normal", "normal"))
     """Squashed, it runs away: nothing holds the mean back where tanh is flat."""
-    mean_bound_cost: float = setting(1.0, at_least=0)
+    mean_bound_coef: float = setting(1.0, at_least=0)
     """Of the squared distance by which a `normal` distribution's mean leaves [-1, 1], where its samples are clipped."""
     num_unrolls: int = setting(1, at_least=1)
     num_minibatches: int = setting(1, at_least=1)
@@ -81,7 +81,7 @@ def learn_once(
     key, shuffle_key, loss_key = jax.random.split(state.key, 3)
     remaining = ground.remaining(state)
     rates = learning_rates(config, state, remaining)
-    entropy_cost = config.entropy_cost * factor(config.entropy_schedule, remaining)
+    entropy_coef = config.entropy_coef * factor(config.entropy_schedule, remaining)
 
     distribution = ground.nets.parametric_action_distribution
 
@@ -93,11 +93,11 @@ def learn_once(
         policy_loss = (part.weight * losses).sum() / jnp.maximum(part.weight.sum(), 1.0)
         further_loss, metrics = value_loss(params, state.normalizer, part)
         metrics |= {"policy_loss": policy_loss, "entropy": entropy, "kl": sampled_kl(log_prob, part.acted_log_prob)}
-        total = policy_loss + further_loss - entropy_cost * entropy
+        total = policy_loss + further_loss - entropy_coef * entropy
         if config.distribution == "normal":
             mean, _ = logits
             metrics["mean_out_of_bounds"] = out_of_bounds(mean)
-            total += config.mean_bound_cost * metrics["mean_out_of_bounds"]
+            total += config.mean_bound_coef * metrics["mean_out_of_bounds"]
         return total, metrics
 
     def minibatch(carry, inputs):
@@ -106,7 +106,7 @@ def learn_once(
         part = jax.tree.map(lambda x: x[rows], samples)
         (total, metrics), grads = jax.value_and_grad(loss, has_aux=True)(params, part, key)
         metrics |= {"loss": total, "grad_norm": optax.global_norm(grads)}
-        return descend(ground.optimizer, params, grads, opt_state, rates), metrics
+        return apply_gradients(ground.optimizer, params, grads, opt_state, rates), metrics
 
     samples = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), samples)
     num_steps = samples.weight.size // config.num_minibatches * config.num_minibatches

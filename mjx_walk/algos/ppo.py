@@ -17,7 +17,7 @@ from mjx_walk.algos.on_policy_update import (
     require_whole_minibatches,
 )
 from mjx_walk.common import networks
-from mjx_walk.common.optimizers import descend
+from mjx_walk.common.optimizers import apply_gradients
 from mjx_walk.common.schedules import factor
 from mjx_walk.envs import Task
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
@@ -62,13 +62,13 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
         loss_fn = functools.partial(
             ppo_losses.compute_ppo_loss,
             ppo_network=nets,
-            entropy_cost=config.entropy_cost * factor(config.entropy_schedule, remaining),
+            entropy_cost=config.entropy_coef * factor(config.entropy_schedule, remaining),
             discounting=config.discount,
             reward_scaling=batch.reward_scale,
             gae_lambda=config.gae_lambda,
             clipping_epsilon=config.clip_epsilon,
             normalize_advantage=config.normalize_advantages,
-            vf_coefficient=config.value_cost,
+            vf_coefficient=config.value_loss_coef,
         )
 
         def minibatch(carry, rows):
@@ -77,7 +77,7 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
             data = jax.tree.map(lambda x: x[rows], batch.transitions)
             grads, metrics = jax.grad(loss_fn, has_aux=True)(params, normalizer, data, loss_key)
             metrics["grad_norm"] = optax.global_norm(grads)
-            return (*descend(ground.optimizer, params, grads, opt_state, rates), key), metrics
+            return (*apply_gradients(ground.optimizer, params, grads, opt_state, rates), key), metrics
 
         def epoch(carry, _):
             params, opt_state, key = carry

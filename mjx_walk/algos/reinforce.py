@@ -24,7 +24,7 @@ class REINFORCEConfig(PolicyGradientConfig):
 
     name: str = setting("reinforce", choices=("reinforce",))
     unroll_length: int = setting(256, at_least=1)
-    max_unseen: float = setting(0.05, above=0, at_most=1)
+    max_tail_discount: float = setting(0.05, above=0, at_most=1)
     """A step is learned from if its piece goes on until what follows counts at most this much."""
     baseline: str = setting("linear", choices=("mean", "linear"))
     """What returns are compared with: the batch's mean, or what a linear fit to the batch expects of an observation."""
@@ -34,8 +34,9 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
     """Build REINFORCE for a task.
 
     Deviation: a copy does not wait for the others' episodes to end. A batch is a piece of `unroll_length` steps, of
-    which the first are learned from: those after which it goes on until what follows is discounted away (`max_unseen`).
-    Whether a step's episode ended within the piece makes no difference, or falls would be learned from more often than
+    which the first are learned from: those after which it goes on until what follows is discounted away
+    (`max_tail_discount`). Whether a step's episode ended within the piece makes no difference, or falls would be
+    learned from more often than
     what prevents them.
 
     Args:
@@ -48,11 +49,11 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
         UserError: see `check_minibatches`; or the pieces are too short to learn from.
     """
     unseen_after_piece = [config.discount ** (config.unroll_length - step) for step in range(config.unroll_length)]
-    num_learned = sum(unseen <= config.max_unseen for unseen in unseen_after_piece)
+    num_learned = sum(unseen <= config.max_tail_discount for unseen in unseen_after_piece)
     if num_learned == 0:
         raise UserError(
             f"algo.unroll_length={config.unroll_length}: at its first step, what follows a piece counts "
-            f"{unseen_after_piece[0]:.2f}, above algo.max_unseen={config.max_unseen}; "
+            f"{unseen_after_piece[0]:.2f}, above algo.max_tail_discount={config.max_tail_discount}; "
             "lengthen it, or lower algo.discount"
         )
     check_minibatches(num_envs * config.num_unrolls * num_learned, config)
@@ -70,7 +71,7 @@ def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, conf
             config.discount,
         )
         # Of these steps, only those before a time limit can have too much unseen.
-        weight = jnp.float32(config.max_unseen >= unseen.T[:, :num_learned])
+        weight = jnp.float32(config.max_tail_discount >= unseen.T[:, :num_learned])
         advantage, obs = return_to_go.T[:, :num_learned], data.observation[:, :num_learned]
         advantage = normalize(advantage, weight)
         if config.baseline == "linear":

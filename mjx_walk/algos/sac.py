@@ -14,7 +14,7 @@ from brax.training.agents.sac.networks import SACNetworks
 
 from mjx_walk.algos.off_policy import Batch, Learner, OffPolicyConfig, make_off_policy
 from mjx_walk.common import networks
-from mjx_walk.common.optimizers import descend, make_adam, move_towards
+from mjx_walk.common.optimizers import apply_gradients, make_adam, move_towards
 from mjx_walk.envs import Task
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.settings import setting
@@ -112,7 +112,7 @@ def make_sac_learner(
             key,
         )
         rate = config.critic_learning_rate * batch.rate_factor
-        critic, critic_optimizer = descend(optimizer, state.critic, grads, state.critic_optimizer, rate)
+        critic, critic_optimizer = apply_gradients(optimizer, state.critic, grads, state.critic_optimizer, rate)
         new_state = state.replace(
             critic=critic,
             critic_optimizer=critic_optimizer,
@@ -128,11 +128,11 @@ def make_sac_learner(
             state.policy, None, state.critic, jnp.exp(state.log_alpha), batch.transitions, policy_key
         )
         new_state, metrics = critic_update(state, batch, critic_key)
-        log_alpha, alpha_optimizer = descend(
+        log_alpha, alpha_optimizer = apply_gradients(
             optimizer, state.log_alpha, alpha_grad, state.alpha_optimizer, config.alpha_learning_rate
         )
         rate = config.policy_learning_rate * batch.rate_factor
-        policy, policy_optimizer = descend(optimizer, state.policy, grads, state.policy_optimizer, rate)
+        policy, policy_optimizer = apply_gradients(optimizer, state.policy, grads, state.policy_optimizer, rate)
         new_state = new_state.replace(
             policy=policy, policy_optimizer=policy_optimizer, log_alpha=log_alpha, alpha_optimizer=alpha_optimizer
         )

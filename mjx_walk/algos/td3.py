@@ -11,7 +11,7 @@ from brax.training import types as brax_types
 
 from mjx_walk.algos.off_policy import Batch, Learner, OffPolicyConfig, make_off_policy
 from mjx_walk.common import networks
-from mjx_walk.common.optimizers import descend, make_adam, move_towards
+from mjx_walk.common.optimizers import apply_gradients, make_adam, move_towards
 from mjx_walk.envs import Task
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.settings import setting
@@ -111,7 +111,7 @@ def make_deterministic_learner(
         target = critic_target(state, batch, key)
         (loss, value), grads = jax.value_and_grad(critic_loss, has_aux=True)(state.critic, target, batch)
         rate = config.critic_learning_rate * batch.rate_factor
-        critic, critic_optimizer = descend(optimizer, state.critic, grads, state.critic_optimizer, rate)
+        critic, critic_optimizer = apply_gradients(optimizer, state.critic, grads, state.critic_optimizer, rate)
         metrics = {"critic_loss": loss, "critic_value": value, "critic_grad_norm": optax.global_norm(grads)}
         return state.replace(critic=critic, critic_optimizer=critic_optimizer), metrics
 
@@ -124,7 +124,7 @@ def make_deterministic_learner(
         state, metrics = critic_update(state, batch, key)
         loss, grads = jax.value_and_grad(policy_loss)(state.policy, state.critic, batch)
         rate = config.policy_learning_rate * batch.rate_factor
-        policy, policy_optimizer = descend(optimizer, state.policy, grads, state.policy_optimizer, rate)
+        policy, policy_optimizer = apply_gradients(optimizer, state.policy, grads, state.policy_optimizer, rate)
         state = state.replace(
             policy=policy,
             policy_optimizer=policy_optimizer,

@@ -9,13 +9,13 @@ from mjx_walk.utils import collectives
 
 
 def make_adam(max_grad_norm: float | None = None) -> optax.GradientTransformation:
-    """Adam without its learning rate, which `descend` multiplies in, after clipping by the global norm if asked."""
+    """Adam without its learning rate, which `apply_gradients` applies, after clipping by the global norm if asked."""
     if max_grad_norm is None:
         return optax.scale_by_adam()
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.scale_by_adam())
 
 
-def descend(
+def apply_gradients(
     optimizer: optax.GradientTransformation, params: Any, grads: Any, state: optax.OptState, rate: Any
 ) -> tuple[Any, optax.OptState]:
     """One step down the gradient, its mean over the devices: `(params, optimizer state)` after it.

@@ -56,24 +56,22 @@ class Parity:
         return all(error.is_within for error in self.errors) and not (self.termination_mismatches or self.overflows)
 
 
-def reference_states(task: Task, num_copies: int, num_steps: int, seed: int) -> tuple[State, jax.Array]:
+def reference_states(task: Task, num_envs: int, num_steps: int, seed: int) -> tuple[State, jax.Array]:
     """States on C trajectories under random actions, and the action taken from each.
 
     A third of the copies starts in the air; none is reset, so all lie on the floor in the end.
 
     Returns:
-        `[num_steps · num_copies, …]`.
+        `[num_steps · num_envs, …]`.
     """
     start_key, action_key = jax.random.split(jax.random.PRNGKey(seed))
-    start = jax.vmap(task.reset)(jax.random.split(start_key, num_copies)).physics
+    start = jax.vmap(task.reset)(jax.random.split(start_key, num_envs)).physics
     height = 2 if task.options.name.startswith("humanoid") else 1
-    lift = jnp.where(jnp.arange(num_copies) % 3 == 0, AIRBORNE_HEIGHT, 0.0)
+    lift = jnp.where(jnp.arange(num_envs) % 3 == 0, AIRBORNE_HEIGHT, 0.0)
     state = jax.vmap(task.reset_to)(start.qpos.at[:, height].add(lift), start.qvel)
 
     def one(state, key):
-        action = jax.random.uniform(
-            key, (num_copies, task.action_size), minval=task.action_low, maxval=task.action_high
-        )
+        action = jax.random.uniform(key, (num_envs, task.action_size), minval=task.action_low, maxval=task.action_high)
         return jax.vmap(task.step)(state, action), (state, action)
 
     _, visited = jax.lax.scan(one, state, jax.random.split(action_key, num_steps))
@@ -123,12 +121,12 @@ def _error(name: str, expected: jax.Array, found: jax.Array, kind: str = "other"
     return Error(name, float(np.median(worst)), float(np.quantile(worst, 0.99)), TOLERANCES[kind])
 
 
-def check(name: str, version: str, physics: str, num_copies: int, num_steps: int, seed: int = 0) -> Parity:
+def check(name: str, version: str, physics: str, num_envs: int, num_steps: int, seed: int = 0) -> Parity:
     """Compare one task on one engine with the reference, which runs on the CPU whatever the engine runs on."""
     cpu = jax.local_devices(backend="cpu")[0]
     with jax.default_device(cpu):
         reference = make_env(name, physics="c", version=version)
-        states, actions = jax.device_get(reference_states(reference, num_copies, num_steps, seed))
+        states, actions = jax.device_get(reference_states(reference, num_envs, num_steps, seed))
         expected = one_step(reference, states, actions)
     engine = make_env(name, physics=physics, version=version)
     return compare(engine, expected, one_step(engine, states, actions))

@@ -99,7 +99,7 @@ def brax_ppo_speed(num_envs: int, batch_size: int, num_minibatches: int, num_upd
 
 
 def sac_update_speeds(
-    num_envs: int, batch_size: int, updates_per_step: int, replay_capacity: int, num_steps: int
+    num_envs: int, batch_size: int, grad_updates_per_step: int, replay_capacity: int, num_steps: int
 ) -> tuple[float, float]:
     """Gradient updates per second of our SAC and of Brax's, on Brax's `humanoid`, once the replay is full.
 
@@ -109,7 +109,7 @@ def sac_update_speeds(
     Args:
         num_envs: copies.
         batch_size: of an update.
-        updates_per_step: for each step of all copies.
+        grad_updates_per_step: for each step of all copies.
         replay_capacity: transitions, all of them filled under an untrained policy before the clock starts.
         num_steps: steps of all copies that are timed, after as many that compile and warm up.
 
@@ -119,10 +119,10 @@ def sac_update_speeds(
     env = brax.envs.get_environment("humanoid", backend="mjx")
     config = SACConfig(
         unroll_length=1,
-        updates_per_step=updates_per_step,
+        grad_updates_per_step=grad_updates_per_step,
         batch_size=batch_size,
         replay_capacity=replay_capacity,
-        prefill_steps=replay_capacity,
+        learning_starts=replay_capacity,
         observation_clip=None,
     )
     algorithm = make_sac(BraxTask(env), num_envs, EvaluationConfig(1), config)  # type: ignore[arg-type]
@@ -152,10 +152,10 @@ def sac_update_speeds(
         tau=config.tau,
         min_replay_size=replay_capacity,
         max_replay_size=replay_capacity,
-        grad_updates_per_step=updates_per_step,
+        grad_updates_per_step=grad_updates_per_step,
         network_factory=lambda *args, **kwargs: sac_networks.make_sac_networks(
             *args, hidden_layer_sizes=(256, 256), **kwargs
         ),
         progress_fn=lambda _, metrics: speeds.append(float(metrics.get("training/sps", 0.0))),
     )
-    return ours, speeds[-1] / num_envs * updates_per_step
+    return ours, speeds[-1] / num_envs * grad_updates_per_step

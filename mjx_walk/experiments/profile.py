@@ -27,7 +27,7 @@ def _seconds_per_call(advance: Callable[[Any], Any], carry: Any, seconds: float)
     return carry, (time.monotonic() - start) / calls
 
 
-def time_parts(algorithm: Algorithm, updates_per_chunk: int, fused: bool, seconds: float) -> dict[str, float]:
+def time_parts(algorithm: Algorithm, iterations_per_call: int, fused: bool, seconds: float) -> dict[str, float]:
     """Seconds of collecting and of learning in one update.
 
     Collecting is timed in chunks that only collect: Warp records its kernels anew wherever its arrays lie at new
@@ -35,7 +35,7 @@ def time_parts(algorithm: Algorithm, updates_per_chunk: int, fused: bool, second
 
     Args:
         algorithm: whose replay, if it has one, learns from the first step on.
-        updates_per_chunk: as the loop runs them.
+        iterations_per_call: as the loop runs them.
         fused: see `make_chunk`.
         seconds: to measure each for.
     """
@@ -43,13 +43,13 @@ def time_parts(algorithm: Algorithm, updates_per_chunk: int, fused: bool, second
     def read(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
         return state, {"all": jnp.stack([jnp.sum(x, dtype=jnp.float32) for x in jax.tree.leaves(batch)]).sum()}
 
-    only_collect = make_chunk(algorithm._replace(learn=read), updates_per_chunk, fused)
+    only_collect = make_chunk(algorithm._replace(learn=read), iterations_per_call, fused)
     state = make_init(algorithm)(jax.random.PRNGKey(0))
     state, collecting = _seconds_per_call(lambda state: only_collect(state)[0], state, seconds)
     state, batch = jax.jit(algorithm.collect, donate_argnums=0)(state)
     learn = jax.jit(algorithm.learn, donate_argnums=0)
     _, learning = _seconds_per_call(lambda state: learn(state, batch)[0], state, seconds)
-    return {"collecting": collecting / updates_per_chunk, "learning": learning}
+    return {"collecting": collecting / iterations_per_call, "learning": learning}
 
 
 def learning_flops(algorithm: Algorithm) -> float:

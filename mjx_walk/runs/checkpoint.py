@@ -28,6 +28,14 @@ _NUMPY = "arrays.npz"
 _REPLAY = "replay"
 """The TrainState's field that is kept in the newest checkpoint only, in a part of its own."""
 
+_RENAMED_LEAVES = {
+    "updates": "iterations",
+    "env.is_whole": "env.started_at_reset",
+    "env.live.snapshot_update": "env.live.snapshot_iteration",
+    "env.live.best_update": "env.live.best_iteration",
+}
+"""Leaves by their former paths, which older checkpoints hold."""
+
 HostArrays = dict[str, np.ndarray]
 """The leaves of a pytree by their paths, copied to the host."""
 
@@ -90,6 +98,7 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
             f"this is {__version__} with format {FORMAT}"
         )
     wanted = _named_leaves(like)
+    meta["crc32"] = {present_name(name): crc for name, crc in meta["crc32"].items()}
     arrays = _read(path / _ARRAYS)
     if any(_is_replay(name) for name in meta["crc32"]):
         if (path / _REPLAY).exists():
@@ -113,6 +122,14 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
             )
     leaves = [jnp.asarray(arrays[name]) for name in wanted]
     return jax.tree.unflatten(jax.tree.structure(like), leaves), meta
+
+
+def present_name(leaf: str) -> str:
+    """The present path of a leaf."""
+    for old, new in _RENAMED_LEAVES.items():
+        if leaf == old or leaf.startswith(f"{old}."):
+            return new + leaf[len(old) :]
+    return leaf
 
 
 def read_meta(path: Path) -> dict[str, Any]:
@@ -141,7 +158,7 @@ def restore_newest(
     folder: Path,
     like: Any,
     part: Callable[[Path], Path] = lambda path: path,
-    agree: Callable[[bool], bool] = lambda is_whole: is_whole,
+    agree: Callable[[bool], bool] = lambda is_complete: is_complete,
 ) -> tuple[Any, dict[str, Any]]:
     """The newest checkpoint that is whole; a damaged one is passed over with a warning.
 
@@ -234,11 +251,13 @@ def _read(path: Path) -> HostArrays:
     try:
         if (path / _NUMPY).exists():
             with np.load(path / _NUMPY) as arrays:
-                return dict(arrays)
-        with _checkpointer() as checkpointer:
-            return checkpointer.restore(path.absolute())
+                found = dict(arrays)
+        else:
+            with _checkpointer() as checkpointer:
+                found = checkpointer.restore(path.absolute())
     except Exception as error:  # Orbax reports damage through many types
         raise ValueError(f"{path} is damaged: {str(error).splitlines()[0][:200]}") from error
+    return {present_name(name): array for name, array in found.items()}
 
 
 def _checkpointer() -> ocp.Checkpointer:

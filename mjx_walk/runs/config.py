@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,21 @@ from mjx_walk.envs.physics import ENGINES
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting, validate
 
+_RENAMED = {
+    "updates_per_chunk": "iterations_per_call",
+    "checkpoint.every_chunks": "checkpoint.every_calls",
+    "algo.updates_per_step": "algo.grad_updates_per_step",
+    "algo.prefill_steps": "algo.learning_starts",
+    "algo.measured_steps": "algo.normalizer_warmup_steps_per_env",
+    "algo.return_bound": "algo.normalized_return_max",
+    "algo.stagger_episodes": "algo.init_at_random_episode_step",
+    "algo.max_unseen": "algo.max_tail_discount",
+    "algo.value_cost": "algo.value_loss_coef",
+    "algo.entropy_cost": "algo.entropy_coef",
+    "algo.mean_bound_cost": "algo.mean_bound_coef",
+}
+"""Settings by their former names. Saved configurations may hold these; on a command line they warn."""
+
 CONFIG_DIR = str(Path(__file__).parents[1] / "configs")
 
 
@@ -31,7 +47,7 @@ CONFIG_DIR = str(Path(__file__).parents[1] / "configs")
 class CheckpointConfig:
     """Saving."""
 
-    every_chunks: int = setting(50, at_least=1)
+    every_calls: int = setting(50, at_least=1)
     keep: int = setting(3, at_least=1)
     """Newest checkpoints kept; the best policy is kept beside them."""
 
@@ -51,7 +67,7 @@ class Config:
     num_envs: int = setting(8192, at_least=1)
     total_steps: int = setting(100_000_000, at_least=1)
     """Environment steps over all copies, rounded up to whole chunks."""
-    updates_per_chunk: int = setting(1, at_least=1)
+    iterations_per_call: int = setting(1, at_least=1)
     """Updates compiled into one program call; logging, evaluation and saving happen between chunks. With a single one
     Warp records its kernels anew in most chunks, since some of what physics reads has moved."""
     run_dir: str | None = None
@@ -133,9 +149,17 @@ def complete_overrides(overrides: list[str]) -> list[str]:
     return overrides
 
 
+def present_key(key: str) -> str:
+    """The present name of a setting."""
+    return _RENAMED.get(key, key)
+
+
 def _as_text(override: Override) -> str:
-    """As it was written; what is a text in quotes, since Hydra would read the folder 2026_11_23 as a number."""
+    """The override under its present name, its text quoted where Hydra would read the folder 2026_11_23 as a number."""
     key, line = override.key_or_group, str(override.input_line)
+    if key in _RENAMED:
+        warnings.warn(f"{key} is now {_RENAMED[key]}", stacklevel=2)
+        return f"{_RENAMED[key]}={line.partition('=')[2]}"
     if key in ("run_dir", "wandb_project") and isinstance(override.value(), (bool, int, float)):
         return f"{key}='{line.partition('=')[2]}'"
     return line
@@ -166,11 +190,21 @@ def read_config(path: Path) -> Config:
         UserError: the file is not a configuration of this version.
     """
     try:
-        saved = OmegaConf.load(path)
+        saved = _under_present_names(OmegaConf.load(path))
         schema = OmegaConf.structured(Config(env=TASKS[saved.env.name][1](), algo=ALGORITHMS[saved.algo.name][1]()))
         return to_config(OmegaConf.merge(schema, saved))
     except (KeyError, AttributeError, yaml.YAMLError, OmegaConfBaseException) as error:
         raise UserError(f"{path} is not a configuration of this version: {_first_line(error)}") from error
+
+
+def _under_present_names(saved: Any) -> Any:
+    """A saved configuration, its renamed settings moved to their present names."""
+    for old, new in _RENAMED.items():
+        section, _, name = old.rpartition(".")
+        node = OmegaConf.select(saved, section) if section else saved
+        if node is not None and name in node:
+            node[new.rpartition(".")[2]] = node.pop(name)
+    return saved
 
 
 def _first_line(error: BaseException) -> str:
@@ -224,7 +258,7 @@ def training_command(config: Config) -> str:
 _NOT_LEARNED_FROM = (
     "hardware",
     "physics",
-    "updates_per_chunk",
+    "iterations_per_call",
     "run_dir",
     "resume",
     "wandb",

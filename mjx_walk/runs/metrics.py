@@ -22,13 +22,13 @@ def is_sum(name: str, reward_terms: tuple[str, ...]) -> bool:
     return name in ("episodes", "return", "length", *_SUMS, *reward_terms)
 
 
-def name_metrics(metrics: Metrics, reward_terms: tuple[str, ...], steps_per_update: int) -> Row:
+def name_metrics(metrics: Metrics, reward_terms: tuple[str, ...], steps_per_iteration: int) -> Row:
     """Turn the metrics of one chunk into a log row.
 
     Args:
         metrics: `[updates] f32` each: the sums of `VectorEnv.step`, and the learner's means.
         reward_terms: which of them are reward terms.
-        steps_per_update: environment steps of an update.
+        steps_per_iteration: environment steps of an update.
 
     Returns:
         `episode/…`: means over the episodes that ended (absent if none did); `physics/…` and `resets/…`: counts;
@@ -47,11 +47,11 @@ def name_metrics(metrics: Metrics, reward_terms: tuple[str, ...], steps_per_upda
     row["physics/overflow"] = counts["overflow"]
     row["resets/count"] = counts["resets"]
     row["resets/reuse_rate"] = counts["resets_reused"] / max(counts["resets"], 1.0)
-    scores = {name: values.pop(f"eval_{name}") for name in ("return", "return_std", "length", "update")}
+    scores = {name: values.pop(f"eval_{name}") for name in ("return", "return_std", "length", "iteration")}
     ended = np.flatnonzero(~np.isnan(scores["return"]))
     if ended.size:
         last = {name: float(value[ended[-1]]) for name, value in scores.items()}
-        row["eval/env_steps"] = last.pop("update") * steps_per_update
+        row["eval/env_steps"] = last.pop("iteration") * steps_per_iteration
         row |= {f"eval/{name}": value for name, value in last.items()}
     # Over the updates that have it: nothing is learned from a first batch, or before a replay is filled.
     known = {name: value[~np.isnan(value)] for name, value in values.items()}
@@ -68,8 +68,8 @@ def physics_warnings(row: Row, num_steps: int) -> dict[str, str]:
     found = {}
     if row["physics/overflow"]:
         found["physics/overflow"] = (
-            "a Warp buffer overflowed, so that contacts were lost in some copies: enlarge CONTACTS_PER_COPY or "
-            "CONSTRAINTS_PER_COPY in envs/physics/mjx_warp.py"
+            "a Warp buffer overflowed, so that contacts were lost in some copies: enlarge CONTACTS_PER_ENV or "
+            "CONSTRAINTS_PER_ENV in envs/physics/mjx_warp.py"
         )
     if row["physics/nonfinite"] > _MANY * num_steps:
         found["physics/nonfinite"] = (

@@ -130,7 +130,9 @@ def in_place(collect: Callable[[Any], tuple[Any, Any]]) -> Callable[[Any, Any], 
 def per_device(config: Any, size: int) -> Any:
     """An algorithm's settings for one of several devices, which counts its own steps only."""
     shares = {
-        name: -(-getattr(config, name) // size) for name in ("schedule_steps", "prefill_steps") if hasattr(config, name)
+        name: -(-getattr(config, name) // size)
+        for name in ("schedule_steps", "learning_starts")
+        if hasattr(config, name)
     }
     return dataclasses.replace(config, **shares)
 

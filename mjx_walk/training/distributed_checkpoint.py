@@ -35,8 +35,8 @@ def restore_newest(checkpoints: Path, like: TrainState, team: Team | None) -> tu
         before = checkpoint.read_meta(path).get(NUM_DEVICES, 1)
         return device_folder(checkpoints, rank % before) / path.name
 
-    def agree(is_whole: bool) -> bool:
-        return all(team.gather(is_whole)) if team else is_whole
+    def agree(is_complete: bool) -> bool:
+        return all(team.gather(is_complete)) if team else is_complete
 
     state, facts = checkpoint.restore_newest(checkpoints, like, part, agree)
     before = facts.get(NUM_DEVICES, 1)
@@ -53,5 +53,5 @@ def _recount(state: TrainState, before: int, size: int) -> TrainState:
         return jnp.int32(updates * before // size)
 
     live = state.env.live
-    live = live.replace(snapshot_update=scaled(live.snapshot_update), best_update=scaled(live.best_update))
-    return state.replace(updates=scaled(state.updates), env=state.env.replace(live=live))
+    live = live.replace(snapshot_iteration=scaled(live.snapshot_iteration), best_iteration=scaled(live.best_iteration))
+    return state.replace(iterations=scaled(state.iterations), env=state.env.replace(live=live))

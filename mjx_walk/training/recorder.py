@@ -38,7 +38,7 @@ class Recorder:
         self._team = team
         self._num_devices = team.size if team else 1
         self._saver = checkpoint.BackgroundSaver(self._checkpoints, config.checkpoint.keep)
-        self._best_update = -1
+        self._best_iteration = -1
         self._writer: MetricsWriter | None = None
         self._wandb: WandbLog | None = None
         self._filmer = Filmer(config, folder) if config.evaluation.films else None
@@ -56,7 +56,7 @@ class Recorder:
         """
         state, facts = restore_newest(self._folder.checkpoints, like, self._team)
         if self._best_policy(state):
-            self._best_update = int(state.env.live.best_update)
+            self._best_iteration = int(state.env.live.best_iteration)
         return state, facts
 
     def begin(self, env_steps: int, trains_on: bool) -> None:
@@ -90,8 +90,8 @@ class Recorder:
         best = self._best_policy(state)
         if not best:
             parts.append((self._folder.best_policy, self._algorithm.policy_params(state), {"env_steps": env_steps}))
-        elif int(state.env.live.best_update) != self._best_update:
-            self._best_update = int(state.env.live.best_update)
+        elif int(state.env.live.best_iteration) != self._best_iteration:
+            self._best_iteration = int(state.env.live.best_iteration)
             parts.append((self._folder.best_policy, *best))
         self._saver.save(*parts, self._whole(state, env_steps, wall_seconds))
 
@@ -151,7 +151,7 @@ class Recorder:
         live = state.env.live
         if math.isinf(live.best_return):
             return None
-        env_steps = int(live.best_update) * self._algorithm.steps_per_update * self._num_devices
+        env_steps = int(live.best_iteration) * self._algorithm.steps_per_iteration * self._num_devices
         return live.best_policy_params, {"env_steps": env_steps, "eval_return": float(live.best_return)}
 
 

@@ -104,21 +104,21 @@ class Trainer:
         self._team = team
         settings = per_device(config.algo, team.size) if team else config.algo
         alone = make_algorithm(task, config.num_envs, config.evaluation, settings)
-        self._steps_per_update = alone.steps_per_update * (team.size if team else 1)
+        self._steps_per_iteration = alone.steps_per_iteration * (team.size if team else 1)
         make_recorder = Follower if team and team.rank else Recorder
         self.recorders = [
             make_recorder(own, task, alone, folder, team) for own, folder in zip(configs, folders, strict=True)
         ]
-        self.steps_per_chunk = self._steps_per_update * config.updates_per_chunk
-        self.num_chunks = -(-config.total_steps // self.steps_per_chunk)
+        self.steps_per_call = self._steps_per_iteration * config.iterations_per_call
+        self.num_chunks = -(-config.total_steps // self.steps_per_call)
         if team:
             self.algorithm = team.beginning(alone)
-            self._chunk = team.make_chunk(alone, config.updates_per_chunk, task.reward_terms)
+            self._chunk = team.make_chunk(alone, config.iterations_per_call, task.reward_terms)
         else:
             self.algorithm = over_seeds(alone) if len(configs) > 1 else alone
-            self._chunk = make_chunk(self.algorithm, config.updates_per_chunk, fused=not task.engine.calls_host)
+            self._chunk = make_chunk(self.algorithm, config.iterations_per_call, fused=not task.engine.calls_host)
         self._has_axis = team is not None or len(configs) > 1  # in front of every array
-        self._are_sound = jax.jit(jax.vmap(self._has_finite_policy) if self._has_axis else self._has_finite_policy)
+        self._are_finite = jax.jit(jax.vmap(self._has_finite_policy) if self._has_axis else self._has_finite_policy)
         self._on_metrics = on_metrics or (lambda row: None)
         self._started = time.monotonic()
         self._times: collections.deque[tuple[float, int]] = collections.deque()
@@ -135,11 +135,11 @@ class Trainer:
             UserError: a policy is not finite any more.
         """
         state, chunk = self._start()
-        progress = Progress(self.num_chunks * self.steps_per_chunk, chunk * self.steps_per_chunk)
+        progress = Progress(self.num_chunks * self.steps_per_call, chunk * self.steps_per_call)
         saved_chunk = chunk or -1
         self._times.append((time.monotonic(), chunk))
         for recorder in self.recorders:
-            recorder.begin(chunk * self.steps_per_chunk, trains_on=chunk < self.num_chunks)
+            recorder.begin(chunk * self.steps_per_call, trains_on=chunk < self.num_chunks)
         diverged: set[int] = set()
         with Interrupt() as interrupt:
             while chunk < self.num_chunks and not self._stop_signal(interrupt) and not diverged:
@@ -148,9 +148,9 @@ class Trainer:
                 rows = self._rows(chunk, metrics)  # waits for the chunk, so that its row tells the time of its end
                 self._log(state, rows, progress)
                 diverged = {
-                    r.config.seed for r, ok in zip(self.recorders, self._soundness(state), strict=True) if not ok
+                    r.config.seed for r, ok in zip(self.recorders, self._finiteness(state), strict=True) if not ok
                 }
-                if chunk % self.config.checkpoint.every_chunks == 0:
+                if chunk % self.config.checkpoint.every_calls == 0:
                     self._save(state, chunk)
                     saved_chunk = chunk
             signal_name = self._stop_signal(interrupt)
@@ -160,12 +160,12 @@ class Trainer:
         if hasattr(state, "replay"):
             state = state.replace(replay=())  # saved, and not looked at again
         for recorder, own in zip(self.recorders, self._split(state), strict=True):
-            recorder.end(own, chunk * self.steps_per_chunk)
+            recorder.end(own, chunk * self.steps_per_call)
             if signal_name or diverged:
                 recorder.wait()
         if diverged:
             raise UserError(
-                f"training has diverged: after {chunk * self.steps_per_chunk:,} steps the policy of seed "
+                f"training has diverged: after {chunk * self.steps_per_call:,} steps the policy of seed "
                 f"{', '.join(map(str, sorted(diverged)))} is not finite any more; checkpoints from before are kept; "
                 "lower the learning rate, or clip gradients"
             )
@@ -209,7 +209,7 @@ class Trainer:
             raise UserError(f"the seeds stand at different steps ({at}); resume each alone")
         self._seconds_before = max(fact["wall_seconds"] for fact in facts)
         state = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *states) if self._has_axis else states[0]
-        return state, steps.pop() // self.steps_per_chunk
+        return state, steps.pop() // self.steps_per_call
 
     def _split(self, state: TrainState) -> list[TrainState]:
         """The TrainState of each run, without an axis in front; if there was one, on the host, where there is room."""
@@ -220,7 +220,7 @@ class Trainer:
 
     def _rows(self, chunk: int, metrics: Metrics) -> list[Row]:
         metrics = jax.device_get(metrics)
-        common = {"env_steps": chunk * self.steps_per_chunk, "wall_seconds": self._seconds()}
+        common = {"env_steps": chunk * self.steps_per_call, "wall_seconds": self._seconds()}
         speed = {
             "speed/steps_per_second": self._speed(chunk),
             "speed/seeds_together": float(len(self.recorders)),
@@ -228,7 +228,7 @@ class Trainer:
         rows = []
         for i in range(len(self.recorders)):
             own = metrics if len(self.recorders) == 1 else {name: value[:, i] for name, value in metrics.items()}
-            rows.append(common | name_metrics(own, self._task.reward_terms, self._steps_per_update) | speed)
+            rows.append(common | name_metrics(own, self._task.reward_terms, self._steps_per_iteration) | speed)
         return rows
 
     def _log(self, state: TrainState, rows: list[Row], progress: Progress) -> None:
@@ -250,7 +250,7 @@ class Trainer:
                 recorder.film(own, int(row["env_steps"]))
 
     def _warn_of_physics(self, row: Row) -> None:
-        for metric, warning in physics_warnings(row, self.steps_per_chunk).items():
+        for metric, warning in physics_warnings(row, self.steps_per_call).items():
             if metric not in self._warned_of:
                 self._warned_of.add(metric)
                 print(f"warning: {warning}; the count is in the metrics as {metric}", file=sys.stderr)
@@ -262,16 +262,16 @@ class Trainer:
             self._times.popleft()
         then, chunk_then = self._times[0]
         self._times.append((now, chunk))
-        return (chunk - chunk_then) * self.steps_per_chunk / max(now - then, 1e-9)
+        return (chunk - chunk_then) * self.steps_per_call / max(now - then, 1e-9)
 
     def _seconds(self) -> float:
         return self._seconds_before + time.monotonic() - self._started
 
     def _save(self, state: TrainState, chunk: int) -> None:
         """Save the TrainState of every run whose policy is finite."""
-        for recorder, own, is_sound in zip(self.recorders, self._split(state), self._soundness(state), strict=True):
-            if is_sound:
-                recorder.save(own, chunk * self.steps_per_chunk, self._seconds())
+        for recorder, own, is_finite in zip(self.recorders, self._split(state), self._finiteness(state), strict=True):
+            if is_finite:
+                recorder.save(own, chunk * self.steps_per_call, self._seconds())
 
     def _stop_signal(self, interrupt: Interrupt) -> str | None:
         """The name of the signal that asks to stop, whichever of the processes it has reached."""
@@ -281,9 +281,9 @@ class Trainer:
         number = max(self._team.gather(number))
         return signal.Signals(number).name if number else None
 
-    def _soundness(self, state: TrainState) -> np.ndarray:
+    def _finiteness(self, state: TrainState) -> np.ndarray:
         """Whether each run's policy is finite, as an array of bool."""
-        return np.atleast_1d(self._are_sound(state))
+        return np.atleast_1d(self._are_finite(state))
 
     def _has_finite_policy(self, state: TrainState) -> jax.Array:
         leaves = jax.tree.leaves(self.algorithm.policy_params(state))

@@ -33,7 +33,7 @@ class Algorithm(NamedTuple):
     """The part of the TrainState that the policy needs, small enough to ship."""
     policy: Callable[..., PolicyFn]
     """`(policy_params, deterministic) → PolicyFn`."""
-    steps_per_update: int
+    steps_per_iteration: int
     """Environment steps, over all copies, of one `collect`."""
     replay_bytes: int = 0
     """Memory of the TrainState's field `replay`, where it has one."""

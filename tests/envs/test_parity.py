@@ -16,7 +16,7 @@ CASES += [("humanoid", "v4", "warp"), ("walker2d", "v5", "jax")]
 
 @pytest.mark.parametrize(("name", "version", "physics"), CASES)
 def test_one_step_from_standing_airborne_and_fallen_states(name, version, physics):
-    found = parity.check(name, version, physics, num_copies=24, num_steps=70)
+    found = parity.check(name, version, physics, num_envs=24, num_steps=70)
     assert found.is_within, "\n".join(map(str, found.errors))
     assert found.num_steps >= 1600
     if name != "humanoid_standup":  # both sides of the healthy range were visited
@@ -88,7 +88,7 @@ def test_warp_overflow_is_reported(monkeypatch):
         return jax.jit(lambda state: jax.lax.scan(one, state, length=20)[1].max())(states)
 
     assert overflows() == 0
-    for buffers in ({"CONSTRAINTS_PER_COPY": 8}, {"CONTACTS_PER_COPY": 0, "SPARE_CONTACTS": 20}):
+    for buffers in ({"CONSTRAINTS_PER_ENV": 8}, {"CONTACTS_PER_ENV": 0, "SPARE_CONTACTS": 20}):
         with monkeypatch.context() as patched:
             for name, size in buffers.items():
                 patched.setattr(mjx_warp, name, size)
