@@ -1,37 +1,35 @@
-"""Many copies of one environment: batching, automatic resets that keep the terminal observation, episode sums."""
+"""Many environments in one batch: automatic resets that keep the terminal observation, and sums over episodes."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import flax
 import jax
 import jax.numpy as jnp
 
-from mjx_walk.envs import State, Task
 from mjx_walk.envs.inline_evaluation import InlineEvaluation, InlineEvaluator
-from mjx_walk.utils.types import Metrics
+from mjx_walk.envs.task import State, Task
+from mjx_walk.utils.types import Metric, Metrics, Reduction
 
 
 class EpisodeSums(flax.struct.PyTreeNode):
-    """Sums over the current episode of each copy, `[B] f32`."""
+    """Sums over the current episode of each environment, `[B] f32`."""
 
     reward: jax.Array
     terms: dict[str, jax.Array]
 
 
 class VectorState(flax.struct.PyTreeNode):
-    """All copies, and the pool of random starts that copies whose episode has ended restart from."""
+    """The environments that train, and the pool of random starts for those whose episode ends."""
 
     env: State
     """`[B, …]`."""
     sums: EpisodeSums
     started_at_reset: jax.Array
-    """`[B] bool`: the current episode began at a reset, so its sums count."""
+    """`[B] bool`: the current episode started at a reset, so its sums count."""
     pool: State
-    """`[R, …]` fresh random resets."""
+    """`[B, …]` fresh random resets."""
     pool_used: jax.Array
-    """`[] i32`: starts handed out since the pool was renewed."""
-    live: InlineEvaluation
-    """The evaluation that rides along."""
+    """`[] i32`: starts taken since the pool was renewed."""
 
 
 class Outcome(NamedTuple):
@@ -45,117 +43,109 @@ class Outcome(NamedTuple):
 
 
 class VectorEnv:
-    """`num_envs` copies of a task that learn, and the evaluator's, all stepped together."""
+    """`num_envs` environments that train and those of the inline evaluation, stepped in one physics call."""
 
-    def __init__(self, task: Task, num_envs: int, evaluator: InlineEvaluator, stagger: bool = False):
+    def __init__(
+        self, task: Task, num_envs: int, evaluator: InlineEvaluator, init_at_random_episode_step: bool = False
+    ):
         """
         Args:
             task: the unbatched environment.
-            num_envs: copies, B.
-            evaluator: its copies, at most B, join the batch.
-            stagger: start the copies at random times of their first episode, so that copies which never fall are
-                not cut off all at once. These first, shorter episodes are left out of the episode metrics.
+            num_envs: number of environments that train, B.
+            evaluator: its environments, at most B, join the batch.
+            init_at_random_episode_step: start the first episodes at random step counts, so that time limits do not
+                end all episodes at once. The episode metrics leave out these first, shorter episodes.
         """
         self.task = task
         self.num_envs = num_envs
         self.evaluator = evaluator
-        self.stagger = stagger
+        self.init_at_random_episode_step = init_at_random_episode_step
 
-    def init(self, key: jax.Array, policy_params: Any) -> VectorState:
-        """All copies freshly reset, with a new pool; the first evaluation is of `policy_params`."""
-        env_key, pool_key, stagger_key = jax.random.split(key, 3)
+    def init(self, key: jax.Array) -> VectorState:
+        """All environments freshly reset, with a new pool."""
+        env_key, pool_key, episode_step_key = jax.random.split(key, 3)
         env = self._reset_many(env_key)
-        if self.stagger:
+        if self.init_at_random_episode_step:
             limit = self.task.options.max_episode_steps
-            env = env.replace(steps=jax.random.randint(stagger_key, (self.num_envs,), 0, limit, jnp.int32))
+            env = env.replace(steps=jax.random.randint(episode_step_key, (self.num_envs,), 0, limit, jnp.int32))
         zeros = jnp.zeros(self.num_envs, jnp.float32)
-        pool = self._reset_many(pool_key)
         return VectorState(
             env=env,
             sums=EpisodeSums(zeros, dict.fromkeys(self.task.reward_terms, zeros)),
             started_at_reset=env.steps == 0,
-            pool=pool,
+            pool=self._reset_many(pool_key),
             pool_used=jnp.zeros((), jnp.int32),
-            live=self.evaluator.init(policy_params, pool),
         )
 
-    def renew(
-        self, state: VectorState, key: jax.Array, policy_params: Any, update: jax.Array
-    ) -> tuple[VectorState, Metrics]:
-        """Once an update: draw new random starts, and begin the next evaluation where one has ended.
+    def renew_pool(self, state: VectorState, key: jax.Array) -> VectorState:
+        """Draw new random starts, once an iteration.
 
-        A reset observation needs a forward pass, too dear for every copy at every step; hence the pool.
-
-        Args:
-            state: all copies.
-            key: random key.
-            policy_params: the present policy.
-            update: `[] i32`, the number of updates behind it.
-
-        Returns:
-            The next state, and the scores of `InlineEvaluator.next_round`.
+        The observation of a reset needs a forward pass, which is too expensive for every environment at every step.
         """
-        pool = self._reset_many(key)
-        live, scores = self.evaluator.next_round(state.live, policy_params, update, pool)
-        return state.replace(pool=pool, pool_used=jnp.zeros((), jnp.int32), live=live), scores
+        return state.replace(pool=self._reset_many(key), pool_used=jnp.zeros((), jnp.int32))
 
     def _reset_many(self, key: jax.Array) -> State:
         return jax.vmap(self.task.reset)(jax.random.split(key, self.num_envs))
 
-    def step(self, state: VectorState, action: jax.Array) -> tuple[VectorState, Outcome, Metrics]:
-        """Step every copy and restart those whose episode has ended.
+    def step(
+        self, state: VectorState, evaluation: InlineEvaluation, action: jax.Array
+    ) -> tuple[VectorState, InlineEvaluation, Outcome, Metrics]:
+        """Step every environment, and reset those whose episode ends.
 
         Args:
-            state: all copies.
+            state: the environments that train.
+            evaluation: the inline evaluation, stepped with them.
             action: `[B, action_size] f32`, in Gymnasium's units.
 
         Returns:
-            The next state, in which no copy has ended; the outcome before the restarts; and sums over the copies,
-            `[] f32` each, that may be added up over steps: `episodes`, then over the episodes that ended `return`,
-            `length` and each reward term; `nonfinite`, `overflow`, `resets` and `resets_reused`.
+            The next state, in which no episode has ended; the next evaluation; the outcome before the resets; and
+            metrics that may be summed over steps: `episodes`, then over the episodes that ended `return`, `length` and
+            each reward term; `nonfinite`, `overflow`, `resets` and `resets_reused`.
         """
-        env, live = self._step_all(state, action)
+        env, evaluation = self._step_all(state, evaluation, action)
         done = env.terminated | env.truncated
         sums = EpisodeSums(
             state.sums.reward + env.reward,
             {name: state.sums.terms[name] + env.metrics[name] for name in self.task.reward_terms},
         )
-
         num_done = done.sum(dtype=jnp.int32)
         start = (state.pool_used + jnp.cumsum(done) - 1) % self.num_envs
         starts = jax.tree.map(lambda x: x[start], state.pool)
-        restarted = jax.tree.map(lambda new, old: _where(done, new, old), starts, env)
         pool_used = state.pool_used + num_done
         reused = jnp.maximum(pool_used - self.num_envs, 0) - jnp.maximum(state.pool_used - self.num_envs, 0)
-
         ended = jnp.float32(done & state.started_at_reset)
-        stats = {
-            "episodes": ended.sum(),
+        episode_sums = {
             "return": (ended * sums.reward).sum(),
             "length": (ended * env.steps).sum(),
             **{name: (ended * value).sum() for name, value in sums.terms.items()},
+        }
+        counts = {
+            "episodes": ended.sum(),
             "nonfinite": env.metrics["nonfinite"].sum(),
             "overflow": env.metrics["overflow"].sum(),
             "resets": jnp.float32(num_done),
             "resets_reused": jnp.float32(reused),
         }
         next_state = state.replace(
-            env=restarted,
+            env=jax.tree.map(lambda new, old: _where(done, new, old), starts, env),
             sums=jax.tree.map(lambda x: jnp.where(done, 0.0, x), sums),
             started_at_reset=state.started_at_reset | done,
             pool_used=pool_used,
-            live=live,
         )
-        return next_state, Outcome(env.obs, env.reward, env.terminated, env.truncated), stats
+        metrics = {name: Metric(value, Reduction.SUM) for name, value in counts.items()}
+        metrics |= {name: Metric(value, Reduction.PER_EPISODE) for name, value in episode_sums.items()}
+        return next_state, evaluation, Outcome(env.obs, env.reward, env.terminated, env.truncated), metrics
 
-    def _step_all(self, state: VectorState, action: jax.Array) -> tuple[State, InlineEvaluation]:
-        """One physics call for the copies that learn and those that are evaluated."""
-        copies = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), state.env, state.live.env)
-        actions = jnp.concatenate([action, self.evaluator.act(state.live)])
-        copies = jax.vmap(self.task.step)(copies, actions)
-        env = jax.tree.map(lambda x: x[: self.num_envs], copies)
-        evaluated = jax.tree.map(lambda x: x[self.num_envs :], copies)
-        return env, self.evaluator.record(state.live, evaluated)
+    def _step_all(
+        self, state: VectorState, evaluation: InlineEvaluation, action: jax.Array
+    ) -> tuple[State, InlineEvaluation]:
+        """One physics call for the environments that train and those that are evaluated."""
+        envs = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), state.env, evaluation.env)
+        actions = jnp.concatenate([action, self.evaluator.act(evaluation)])
+        envs = jax.vmap(self.task.step)(envs, actions)
+        trained = jax.tree.map(lambda x: x[: self.num_envs], envs)
+        evaluated = jax.tree.map(lambda x: x[self.num_envs :], envs)
+        return trained, self.evaluator.record(evaluation, evaluated)
 
 
 def _where(condition: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:

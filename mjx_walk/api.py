@@ -20,7 +20,7 @@ from mjx_walk.runs.loggers import require_wandb
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.policies import SavedPolicy, make_task
 from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.training.distributed import Team
+from mjx_walk.training.distributed import Processes
 from mjx_walk.training.memory_check import check_replay
 from mjx_walk.training.trainer import Trainer
 from mjx_walk.utils.errors import UserError
@@ -79,14 +79,14 @@ def resolve_seeds(overrides: list[str], seeds: list[int]) -> list[Config]:
 
 
 def train(
-    configs: list[Config], on_metrics: Callable[[Row], None] | None = None, team: Team | None = None
+    configs: list[Config], on_metrics: Callable[[Row], None] | None = None, processes: Processes | None = None
 ) -> tuple[list[RunFolder], str | None]:
     """Train one run, or several that differ in their seed alone side by side; then score them in the real Gymnasium.
 
     Args:
         configs: checked configurations, alike but for `seed` and `run_dir`.
         on_metrics: called with every row that is logged.
-        team: the processes that train one run together; this is one of them.
+        processes: that train one run together; this is one of them.
 
     Returns:
         The run folders, and the name of the signal that stopped them early, if one did.
@@ -102,19 +102,19 @@ def train(
     # Refuses what does not fit before a folder is made.
     algorithm = make_algorithm(task, configs[0].num_envs, configs[0].evaluation, configs[0].algo)
     replay = check_replay(algorithm, Path(configs[0].run_dir or "."), len(configs))
-    is_first = not team or team.rank == 0
-    if is_first:
+    processes = processes or Processes()
+    if processes.is_main_process:
         folders, configs = run_folder.prepare(configs)
-        _announce(configs[0], folders, team.size if team else 1)
+        _announce(configs[0], folders, processes.process_count)
         if replay:
             print(replay, flush=True)
-    if team:
-        path = team.first_ones(str(folders[0].path.absolute()) if is_first else "")
-        folders = [RunFolder(Path(path))]
-    trainer = Trainer(configs, task, folders, on_metrics, team)
+    if processes.process_count > 1:
+        path = str(folders[0].path.absolute()) if processes.is_main_process else ""
+        folders = [RunFolder(Path(processes.broadcast_one_to_all(path)))]
+    trainer = Trainer(configs, task, folders, on_metrics, processes)
     with as_by_ctrl_c():
         signal_name = trainer.train()
-        if signal_name and is_first:
+        if signal_name and processes.is_main_process:
             where = f"run_dir={folders[0].path}"
             if len(folders) > 1:
                 where = f"run_dir={folders[0].path.parent} 'seeds={[config.seed for config in configs]}'"

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, open_dict
 from mjx_walk.api import resolve, resolve_seeds, train
 from mjx_walk.runs.config import CONFIG_DIR, Config, complete_overrides, load_config, register_schemas, to_config
 from mjx_walk.training import launcher
-from mjx_walk.training.distributed import Team, join
+from mjx_walk.training.distributed import Processes, join_processes
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.signals import Stopped, exit_code
@@ -53,23 +53,23 @@ def main(arguments: list[str]) -> int:
     own, settings = cli.parse_own(Own, Config, arguments, USAGE)
     if own.seeds is not None and own.devices is not None:
         raise UserError("give seeds=… or devices=…, not both")
-    team = join() if own.devices is not None else None
-    if own.devices is not None and not team:
-        size = launcher.count(own.devices)
-        if size > 1:
-            resolve(settings)  # says once what is wrong in them
-            return launcher.run(arguments, size)
-    if team:
-        return _train_in_team(settings, team)
+    processes = join_processes() if own.devices is not None else Processes()
+    if processes.process_count > 1:
+        return _train_in_process(settings, processes)
+    if own.devices is not None:
+        count = launcher.count(own.devices)
+        if count > 1:
+            resolve(settings)  # reports invalid settings once
+            return launcher.run(arguments, count)
     configs = resolve_seeds(settings, cli.read_seeds(own.seeds)) if own.seeds is not None else [resolve(settings)]
     _, signal_name = train(configs)
     return exit_code(signal_name) if signal_name else 0
 
 
-def _train_in_team(settings: list[str], team: Team) -> int:
-    """As one process of several. Where it fails it leaves at once, since JAX would wait for those that wait for it."""
+def _train_in_process(settings: list[str], processes: Processes) -> int:
+    """Train as one process of several. Exit immediately on failure: JAX's shutdown would deadlock with the others."""
     try:
-        _, signal_name = train([resolve(settings)], team=team)
+        _, signal_name = train([resolve(settings)], processes=processes)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         os._exit(2)

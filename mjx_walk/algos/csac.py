@@ -1,28 +1,22 @@
-"""Categorical soft actor-critic: SAC whose critics learn the return's distribution, by cross-entropy.
+"""Categorical soft actor-critic: SAC whose critics learn the distribution of returns by cross-entropy.
 
-For thousands of copies. Sources: the categorical critic of C51 (Bellemare et al. 2017) in SAC with normalised rewards,
-as SimbaV2 (Lee et al. 2025) and FlashSAC have it; policy and temperature stay Brax's.
+Sources: the categorical critic of C51 (Bellemare et al. 2017) in SAC with normalised rewards, as in SimbaV2 (Lee et
+al. 2025) and FlashSAC. Policy and temperature are Brax's.
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from brax.training.agents.sac.networks import SACNetworks
+from brax.training.networks import FeedForwardNetwork
 
-from mjx_walk.algos.off_policy import Learner, make_off_policy
-from mjx_walk.algos.sac import SACConfig, make_sac_learner
+from mjx_walk.algos.off_policy import Batch
+from mjx_walk.algos.sac import SAC, SACConfig, SACState
 from mjx_walk.common import networks
-from mjx_walk.envs import Task
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
-from mjx_walk.utils.types import Algorithm, Transition
-
-Distributions = Callable[[Any, jax.Array, jax.Array], jax.Array]
-"""`(critic params, obs, action) → log-probabilities of the atoms`, `[…, 2, num_atoms]`."""
 
 
 @dataclasses.dataclass
@@ -36,61 +30,55 @@ class CSACConfig(SACConfig):
     normalized_return_max: float | None = setting(5.0, above=0)
 
 
-def make_csac(task: Task, num_envs: int, evaluation: EvaluationConfig, config: CSACConfig) -> Algorithm:
-    """Build categorical SAC for a task; see `make_off_policy`.
-
-    Raises:
-        UserError: settings that do not go together.
-    """
-    return make_off_policy(task, num_envs, evaluation, config, make_csac_learner(task, config))
-
-
-def make_csac_networks(task: Task, config: CSACConfig) -> tuple[SACNetworks, Distributions, jax.Array]:
-    """Networks whose critics give expected returns, `[…, 2]`; what these are the means of; and the atoms.
+@dataclasses.dataclass(frozen=True, eq=False)
+class CSAC(SAC):
+    """SAC with categorical critics.
 
     Raises:
         UserError: the returns have no bound.
     """
-    if config.normalized_return_max is None:
-        raise UserError("algo.normalized_return_max=null: csac needs a bound, the range of its atoms")
-    atoms = jnp.linspace(-config.normalized_return_max, config.normalized_return_max, config.num_atoms)
-    critics = networks.make_critics(2, config.num_atoms, task, config)
 
-    def log_distributions(params: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
-        return jax.nn.log_softmax(critics.apply(None, params, obs, action))
+    config: CSACConfig
+    critics: FeedForwardNetwork = dataclasses.field(init=False, repr=False)
+    """Logits of the atoms, `[…, 2, num_atoms]`."""
+    atoms: jax.Array = dataclasses.field(init=False, repr=False)
+    """`[num_atoms] f32`, evenly spaced."""
 
-    def values(_: Any, params: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
-        return jnp.exp(log_distributions(params, obs, action)) @ atoms
+    def make_networks(self) -> SACNetworks:
+        """Policy, and critics that give expected returns, `[…, 2]`."""
+        config = self.config
+        if config.normalized_return_max is None:
+            raise UserError("algo.normalized_return_max=null: csac needs a bound, the range of its atoms")
+        bound = config.normalized_return_max
+        self._set(
+            atoms=jnp.linspace(-bound, bound, config.num_atoms),
+            critics=networks.make_critics(2, config.num_atoms, self.task, config),
+        )
+        expected_returns = dataclasses.replace(self.critics, apply=self._expected_returns)
+        return networks.make_sac_networks(self.task, config, expected_returns)
 
-    nets = networks.make_sac_networks(task, config, dataclasses.replace(critics, apply=values))
-    return nets, log_distributions, atoms
+    def log_probs(self, critic: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
+        """Log-probabilities of the atoms, `[…, 2, num_atoms]`."""
+        return jax.nn.log_softmax(self.critics.apply(None, critic, obs, action))
 
+    def _expected_returns(self, _: Any, critic: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
+        return jnp.exp(self.log_probs(critic, obs, action)) @ self.atoms
 
-def make_csac_learner(task: Task, config: CSACConfig) -> Learner:
-    """SAC's, but for the critics and their loss."""
-    nets, log_distributions, atoms = make_csac_networks(task, config)
-    policy_distribution = nets.parametric_action_distribution
-
-    def make_critic_loss(reward_scale: jax.Array):
-        def critic_loss(
-            critic: Any, policy: Any, _: Any, target_critic: Any, alpha: jax.Array, data: Transition, key: jax.Array
-        ) -> jax.Array:
-            logits = nets.policy_network.apply(None, policy, data.next_observation)
-            raw_action = policy_distribution.sample_no_postprocessing(logits, key)
-            log_prob = policy_distribution.log_prob(logits, raw_action)
-            next_action = policy_distribution.postprocess(raw_action)
-            both = jnp.exp(log_distributions(target_critic, data.next_observation, next_action))
-            lower = (both @ atoms).argmin(axis=-1)
-            next_probs = jnp.take_along_axis(both, lower[:, None, None], axis=1)[:, 0]
-            soft = atoms - (alpha * log_prob)[:, None]
-            future = data.discount[:, None] * soft
-            target = project(next_probs, (data.reward * reward_scale)[:, None] + future, atoms)
-            log_probs = log_distributions(critic, data.observation, data.action)
-            return -(target[:, None] * log_probs).sum(axis=(-2, -1)).mean()
-
-        return critic_loss
-
-    return make_sac_learner(task, config, nets, make_critic_loss)
+    def critic_loss(self, critic: Any, learner: SACState, batch: Batch, key: jax.Array) -> jax.Array:
+        data, distribution = batch.transitions, self.nets.parametric_action_distribution
+        alpha = jnp.exp(learner.log_alpha)
+        logits = self.nets.policy_network.apply(None, learner.policy, data.next_observation)
+        raw_action = distribution.sample_no_postprocessing(logits, key)
+        log_prob = distribution.log_prob(logits, raw_action)
+        next_action = distribution.postprocess(raw_action)
+        both = jnp.exp(self.log_probs(learner.target_critic, data.next_observation, next_action))
+        lower = (both @ self.atoms).argmin(axis=-1)
+        next_probs = jnp.take_along_axis(both, lower[:, None, None], axis=1)[:, 0]
+        soft = self.atoms - (alpha * log_prob)[:, None]
+        future = data.discount[:, None] * soft
+        target = project(next_probs, (data.reward * batch.reward_scale)[:, None] + future, self.atoms)
+        log_probs = self.log_probs(critic, data.observation, data.action)
+        return -(target[:, None] * log_probs).sum(axis=(-2, -1)).mean()
 
 
 def project(probs: jax.Array, positions: jax.Array, atoms: jax.Array) -> jax.Array:

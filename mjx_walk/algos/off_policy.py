@@ -1,7 +1,8 @@
-"""What off-policy algorithms share: act with noise, store, sample, learn. Each brings a `Learner`."""
+"""What SAC, TD3 and DDPG share: acting with noise, the replay, n-step targets, and the schedule of gradient updates."""
 
+import abc
 import dataclasses
-from collections.abc import Callable
+import functools
 from typing import Any, NamedTuple
 
 import flax
@@ -11,15 +12,13 @@ from brax.training.acme import running_statistics
 from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.networks import ACTIVATION
 
+from mjx_walk.algos.base import Algorithm, TrainState
 from mjx_walk.common import networks, returns, rollout
+from mjx_walk.common.optimizers import anneal_discount, remaining_fraction, schedule_factor
 from mjx_walk.common.replay_buffer import Replay, ReplayBuffer, Steps
-from mjx_walk.common.schedules import anneal, anneal_discount, factor
-from mjx_walk.envs import Task
-from mjx_walk.envs.inline_evaluation import EvaluationConfig, InlineEvaluator
-from mjx_walk.envs.vector_env import VectorEnv, VectorState
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
-from mjx_walk.utils.types import Algorithm, Metrics, PolicyFn, Transition
+from mjx_walk.utils.types import RANDOM_KEY, REPLAY, Metrics, PolicyFn, Transition, as_means
 
 
 @dataclasses.dataclass
@@ -73,201 +72,240 @@ class OffPolicyConfig:
 
 
 class Batch(NamedTuple):
-    """What a learner learns from, and with which settings of the moment."""
+    """Transitions to learn from, and the settings that change over a run."""
 
     transitions: Transition
     """`[N, …]`, see `ReplayBuffer.sample`; observations normalised, actions in `[-1, 1]`."""
     reward_scale: jax.Array
     rate_factor: jax.Array | float
-    """The learning rates' share that is left."""
+    """The factor of the learning rates."""
     remaining: jax.Array | float
-    """The share of `schedule_steps` that is left."""
+    """The fraction of `schedule_steps` that is left."""
 
 
-class Learner(NamedTuple):
-    """The networks of an algorithm, their losses and updates. All observations that it sees are normalised."""
-
-    init: Callable[[jax.Array], Any]
-    """`key → state`."""
-    policy_params: Callable[[Any], Any]
-    """The part of the state that the policy needs."""
-    explore: Callable[[Any, jax.Array, jax.Array], jax.Array]
-    """`(policy_params, obs [B, …], key) → action [B, action_size]`, in `[-1, 1]`, with noise."""
-    act: Callable[[Any, jax.Array, jax.Array, bool], jax.Array]
-    """`(policy_params, obs, key, deterministic) → action`, in `[-1, 1]`."""
-    critic_update: Callable[[Any, Batch, jax.Array], tuple[Any, Metrics]]
-    """`(state, batch, key) → (state, metrics)`, leaving the policy as it is."""
-    full_update: Callable[[Any, Batch, jax.Array], tuple[Any, Metrics]]
-    """The same for critic and policy."""
-
-
-class OffPolicyState(flax.struct.PyTreeNode):
-    """Everything that influences the next update."""
+class OffPolicyState(TrainState):
+    """State of an off-policy algorithm."""
 
     learner: Any
+    """Networks and optimizers."""
     critic_updates: jax.Array
-    """`[] i32`: critic updates done."""
+    """`[] i32`: critic updates so far."""
     normalizer: RunningStatisticsState
     return_scale: returns.ReturnScale
-    replay: Replay
-    env: VectorState
-    noise_key: jax.Array
-    """From which the exploration noise of every step follows."""
-    key: jax.Array
-    iterations: jax.Array
-    """`[] i32`: unrolls done."""
+    replay: Replay = flax.struct.field(metadata=REPLAY)
+    noise_key: jax.Array = flax.struct.field(metadata=RANDOM_KEY)
+    """The exploration noise of every step follows from it."""
 
 
-def make_off_policy(
-    task: Task, num_envs: int, evaluation: EvaluationConfig, config: OffPolicyConfig, learner: Learner
-) -> Algorithm:
-    """Build an algorithm around a learner.
+@dataclasses.dataclass(frozen=True, eq=False)
+class OffPolicyAlgorithm(Algorithm):
+    """Stores steps in a replay and learns from samples of it. Subclasses define networks, losses and updates.
 
-    Args:
-        task: the unbatched environment.
-        num_envs: copies that learn.
-        evaluation: of the policy beside them.
-        config: settings.
-        learner: networks, losses and updates.
+    All observations that a subclass sees are normalised, and all its actions lie in `[-1, 1]`.
 
     Raises:
-        UserError: settings that do not go together.
+        UserError: settings that exclude each other.
     """
-    updates_per_unroll = config.grad_updates_per_step * config.unroll_length
-    if updates_per_unroll % config.policy_delay:
-        raise UserError(
-            f"algo.grad_updates_per_step={config.grad_updates_per_step} times "
-            f"algo.unroll_length={config.unroll_length} must be a multiple of algo.policy_delay={config.policy_delay}"
-        )
-    steps_per_iteration = num_envs * config.unroll_length
-    unrolls_kept = max(
-        -(-config.replay_capacity // steps_per_iteration), -(-(config.n_step + 1) // config.unroll_length)
-    )
-    buffer = ReplayBuffer(task, num_envs, unrolls_kept * config.unroll_length, config.replay_dtype)
-    if config.learning_starts > buffer.num_transitions:
-        raise UserError(
-            f"algo.learning_starts={config.learning_starts} is more than algo.replay_capacity={config.replay_capacity}"
-        )
-    rows_before_learning = max(-(-config.learning_starts // num_envs), config.n_step + 1)
 
-    def normalize(normalizer: RunningStatisticsState, obs: jax.Array) -> jax.Array:
-        return running_statistics.normalize(obs, normalizer, max_abs_value=config.observation_clip)
+    config: OffPolicyConfig
+    buffer: ReplayBuffer = dataclasses.field(init=False, repr=False)
 
-    def policy(policy_params: Any, deterministic: bool = True) -> PolicyFn:
+    def __post_init__(self) -> None:
+        config = self.config
+        if self.updates_per_iteration % config.policy_delay:
+            raise UserError(
+                f"algo.grad_updates_per_step={config.grad_updates_per_step} times "
+                f"algo.unroll_length={config.unroll_length} must be a multiple of "
+                f"algo.policy_delay={config.policy_delay}"
+            )
+        num_unrolls = max(
+            -(-config.replay_capacity // self.steps_per_iteration), -(-(config.n_step + 1) // config.unroll_length)
+        )
+        num_rows = num_unrolls * config.unroll_length
+        self._set(buffer=ReplayBuffer(self.task, self.num_envs, num_rows, config.replay_dtype))
+        if config.learning_starts > self.buffer.num_transitions:
+            raise UserError(
+                f"algo.learning_starts={config.learning_starts} is more than "
+                f"algo.replay_capacity={config.replay_capacity}"
+            )
+        super().__post_init__()
+
+    # What an algorithm defines.
+
+    @abc.abstractmethod
+    def init_learner(self, key: jax.Array) -> Any:
+        """Networks and optimizers before the first update."""
+
+    @abc.abstractmethod
+    def act(self, params: Any, obs: jax.Array, key: jax.Array, deterministic: bool) -> jax.Array:
+        """Actions `[B, action_size]` of the policy."""
+
+    @abc.abstractmethod
+    def explore(self, params: Any, obs: jax.Array, key: jax.Array) -> jax.Array:
+        """Actions `[B, action_size]` of the policy with exploration noise."""
+
+    @abc.abstractmethod
+    def critic_update(self, learner: Any, batch: Batch, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+        """One gradient step on the critics: `(learner, metrics)`."""
+
+    @abc.abstractmethod
+    def full_update(self, learner: Any, batch: Batch, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+        """One gradient step on critics and policy: `(learner, metrics)`."""
+
+    # What all of them do.
+
+    @property
+    def steps_per_iteration(self) -> int:
+        return self.num_envs * self.config.unroll_length
+
+    @property
+    def updates_per_iteration(self) -> int:
+        """Critic updates of one `learn`."""
+        return self.config.grad_updates_per_step * self.config.unroll_length
+
+    @property
+    def rows_before_learning(self) -> int:
+        """Steps of all environments before the first update."""
+        return max(-(-self.config.learning_starts // self.num_envs), self.config.n_step + 1)
+
+    @property
+    def replay_bytes(self) -> int:
+        return self.buffer.num_bytes
+
+    def normalize(self, normalizer: RunningStatisticsState, obs: jax.Array) -> jax.Array:
+        """Normalised and clipped observations."""
+        return running_statistics.normalize(obs, normalizer, max_abs_value=self.config.observation_clip)
+
+    def policy_params(self, state: OffPolicyState) -> Any:
+        return (state.normalizer, state.learner.policy)
+
+    def policy(self, policy_params: Any, deterministic: bool = True) -> PolicyFn:
         normalizer, params = policy_params
 
         def act(obs: jax.Array, key: jax.Array) -> jax.Array:
-            return networks.to_env_action(task, learner.act(params, normalize(normalizer, obs), key, deterministic))
+            action = self.act(params, self.normalize(normalizer, obs), key, deterministic)
+            return networks.to_env_action(self.task, action)
 
         return act
 
-    def policy_params(state: OffPolicyState) -> Any:
-        return (state.normalizer, learner.policy_params(state.learner))
-
-    evaluator = InlineEvaluator(task, num_envs, evaluation, policy, steps_per_iteration)
-    env = VectorEnv(task, num_envs, evaluator, config.init_at_random_episode_step)
-
-    def init(key: jax.Array) -> OffPolicyState:
+    def init(self, key: jax.Array) -> OffPolicyState:
         learner_key, env_key, noise_key, key = jax.random.split(key, 4)
-        learner_state = learner.init(learner_key)
-        normalizer = networks.init_normalizer(task.observation_size)
+        learner = self.init_learner(learner_key)
+        normalizer = networks.init_normalizer(self.task.observation_size)
+        env = self.env.init(env_key)
         return OffPolicyState(
-            learner=learner_state,
-            critic_updates=jnp.zeros((), jnp.int32),
-            normalizer=normalizer,
-            return_scale=returns.init_return_scale(num_envs),
-            replay=buffer.init(),
-            env=env.init(env_key, (normalizer, learner.policy_params(learner_state))),
-            noise_key=noise_key,
+            env=env,
+            evaluation=self.evaluator.init((normalizer, learner.policy), env.pool),
             key=key,
             iterations=jnp.zeros((), jnp.int32),
+            learner=learner,
+            critic_updates=jnp.zeros((), jnp.int32),
+            normalizer=normalizer,
+            return_scale=returns.init_return_scale(self.num_envs),
+            replay=self.buffer.init(),
+            noise_key=noise_key,
         )
 
-    def collect(state: OffPolicyState) -> tuple[OffPolicyState, tuple[Steps, Metrics]]:
+    def collect(self, state: OffPolicyState) -> tuple[OffPolicyState, tuple[Steps, Metrics]]:
+        config = self.config
         key, pool_key = jax.random.split(state.key)
         step = state.iterations * config.unroll_length + jnp.arange(config.unroll_length)
         noise_keys = jax.vmap(jax.random.fold_in, (None, 0))(state.noise_key, step // config.noise_repeat)
-        is_random = state.iterations * float(steps_per_iteration) < config.learning_starts
-        params = learner.policy_params(state.learner)
+        env = self.env.renew_pool(state.env, pool_key)
+        evaluation, scores = self.evaluator.next_round(
+            state.evaluation, self.policy_params(state), state.iterations, env.pool
+        )
+        actor = functools.partial(self._explore, state)
+        env, evaluation, steps, metrics = rollout.unroll(self.env, env, evaluation, actor, noise_keys, _keep)
+        return state.replace(env=env, evaluation=evaluation, key=key), (steps, metrics | scores)
 
-        def actor(obs, key):
-            explore_key, uniform_key = jax.random.split(key)
-            chosen = learner.explore(params, normalize(state.normalizer, obs), explore_key)
-            uniform = jax.random.uniform(uniform_key, chosen.shape, minval=-1.0, maxval=1.0)
-            action = jnp.where(is_random, uniform, chosen)
-            return networks.to_env_action(task, action), action
+    def _explore(self, state: OffPolicyState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Gymnasium's action and the networks'; uniformly random before learning starts."""
+        is_random = state.iterations * float(self.steps_per_iteration) < self.config.learning_starts
+        explore_key, uniform_key = jax.random.split(key)
+        chosen = self.explore(state.learner.policy, self.normalize(state.normalizer, obs), explore_key)
+        uniform = jax.random.uniform(uniform_key, chosen.shape, minval=-1.0, maxval=1.0)
+        action = jnp.where(is_random, uniform, chosen)
+        return networks.to_env_action(self.task, action), action
 
-        def keep(step: rollout.Step) -> Steps:
-            outcome = step.outcome
-            return Steps(step.obs, step.extras, outcome.reward, outcome.terminated, outcome.truncated, outcome.obs)
-
-        env_state, scores = env.renew(state.env, pool_key, policy_params(state), state.iterations)
-        env_state, steps, stats = rollout.unroll(env, env_state, actor, noise_keys, keep)
-        return state.replace(env=env_state, key=key), (steps, stats | scores)
-
-    def learn(state: OffPolicyState, collected: tuple[Steps, Metrics]) -> tuple[OffPolicyState, Metrics]:
-        steps, stats = collected
+    def learn(self, state: OffPolicyState, batch: tuple[Steps, Metrics]) -> tuple[OffPolicyState, Metrics]:
+        config = self.config
+        steps, env_metrics = batch
         key, update_key = jax.random.split(state.key)
         normalizer = state.normalizer
         if config.normalize_observations:
-            normalizer = networks.update_normalizer(normalizer, steps.observation)
-        remaining = anneal(state.iterations * float(steps_per_iteration), config.schedule_steps)
+            normalizer = networks.update_normalizer(normalizer, steps.observation, self.axis_name)
+        remaining = remaining_fraction(state.iterations * float(self.steps_per_iteration), config.schedule_steps)
         discount = anneal_discount(config.discount, config.final_discount, remaining)
         ended = steps.terminated | steps.truncated
-        return_scale = returns.update_return_scale(state.return_scale, steps.reward, ended, discount)
+        return_scale = returns.update_return_scale(state.return_scale, steps.reward, ended, discount, self.axis_name)
         reward_scale = jnp.float32(config.reward_scale)
         if config.normalize_rewards:
             reward_scale *= returns.reward_multiplier(return_scale, config.normalized_return_max)
-        rate_factor = factor(config.learning_rate_schedule, remaining)
-        replay = buffer.insert(state.replay, steps)
-
-        def as_batch(transitions: Transition) -> Batch:
-            return Batch(transitions, reward_scale, rate_factor, remaining)
-
-        def critic_update(learner_state, inputs):
-            transitions, key = inputs
-            return learner.critic_update(learner_state, as_batch(transitions), key)[0], None
-
-        def policy_period(learner_state, inputs):
-            """`policy_delay` critic updates, the last of them together with the policy's."""
-            first = jax.tree.map(lambda x: x[:-1], inputs)
-            learner_state, _ = jax.lax.scan(critic_update, learner_state, first)
-            transitions, key = jax.tree.map(lambda x: x[-1], inputs)
-            return learner.full_update(learner_state, as_batch(transitions), key)
-
-        def train(learner_state):
-            # Drawn and normalised in one go, since on a GPU small updates wait for the launch of their kernels.
-            sample_key, key = jax.random.split(update_key)
-            num_transitions = updates_per_unroll * config.batch_size
-            drawn = buffer.sample(replay, sample_key, num_transitions, config.n_step, discount)
-            drawn = drawn._replace(
-                observation=normalize(normalizer, drawn.observation),
-                next_observation=normalize(normalizer, drawn.next_observation),
-            )
-            periods = (updates_per_unroll // config.policy_delay, config.policy_delay)
-            drawn = jax.tree.map(lambda x: x.reshape((*periods, config.batch_size, *x.shape[1:])), drawn)
-            learner_state, metrics = jax.lax.scan(policy_period, learner_state, (drawn, jax.random.split(key, periods)))
-            return learner_state, jax.tree.map(lambda x: x.mean(axis=0), metrics)
-
-        def wait(learner_state):
-            shapes = jax.eval_shape(train, learner_state)[1]
-            return learner_state, jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
-
-        can_learn = replay.rows >= rows_before_learning
-        learner_state, metrics = jax.lax.cond(can_learn, train, wait, state.learner)
+        replay = self.buffer.insert(state.replay, steps)
+        rate_factor = schedule_factor(config.learning_rate_schedule, remaining)
+        settings = functools.partial(Batch, reward_scale=reward_scale, rate_factor=rate_factor, remaining=remaining)
+        train = functools.partial(self._train, settings, replay, normalizer, discount, update_key)
+        can_learn = replay.rows >= self.rows_before_learning
+        learner, metrics = jax.lax.cond(can_learn, train, functools.partial(_wait, train), state.learner)
         new_state = state.replace(
-            learner=learner_state,
-            critic_updates=state.critic_updates + jnp.where(can_learn, updates_per_unroll, 0),
+            learner=learner,
+            critic_updates=state.critic_updates + jnp.where(can_learn, self.updates_per_iteration, 0),
             normalizer=normalizer,
             return_scale=return_scale,
             replay=replay,
             key=key,
             iterations=state.iterations + 1,
         )
-        return new_state, stats | metrics | {
+        facts = {
             "critic_updates": jnp.float32(new_state.critic_updates),
-            "replay_transitions": jnp.minimum(replay.rows, buffer.num_rows) * jnp.float32(num_envs),
+            "replay_transitions": jnp.minimum(replay.rows, self.buffer.num_rows) * jnp.float32(self.num_envs),
             "reward_scale": reward_scale,
         }
+        return new_state, env_metrics | as_means(metrics | facts)
 
-    return Algorithm(init, collect, learn, policy_params, policy, steps_per_iteration, replay_bytes=buffer.num_bytes)
+    def _train(
+        self,
+        settings: functools.partial[Batch],
+        replay: Replay,
+        normalizer: RunningStatisticsState,
+        discount: jax.Array | float,
+        key: jax.Array,
+        learner: Any,
+    ) -> tuple[Any, dict[str, jax.Array]]:
+        """All updates of an iteration: `policy_delay` critic updates at a time, the last of them with the policy's."""
+        config = self.config
+
+        def critic_update(learner, inputs):
+            transitions, key = inputs
+            return self.critic_update(learner, settings(transitions), key)[0], None
+
+        def policy_period(learner, inputs):
+            first = jax.tree.map(lambda x: x[:-1], inputs)
+            learner, _ = jax.lax.scan(critic_update, learner, first)
+            transitions, key = jax.tree.map(lambda x: x[-1], inputs)
+            return self.full_update(learner, settings(transitions), key)
+
+        # Sampled and normalised at once: on a GPU, small updates wait for the launch of their kernels.
+        sample_key, key = jax.random.split(key)
+        num_transitions = self.updates_per_iteration * config.batch_size
+        sampled = self.buffer.sample(replay, sample_key, num_transitions, config.n_step, discount)
+        sampled = sampled._replace(
+            observation=self.normalize(normalizer, sampled.observation),
+            next_observation=self.normalize(normalizer, sampled.next_observation),
+        )
+        periods = (self.updates_per_iteration // config.policy_delay, config.policy_delay)
+        sampled = jax.tree.map(lambda x: x.reshape((*periods, config.batch_size, *x.shape[1:])), sampled)
+        learner, metrics = jax.lax.scan(policy_period, learner, (sampled, jax.random.split(key, periods)))
+        return learner, jax.tree.map(lambda x: x.mean(axis=0), metrics)
+
+
+def _keep(step: rollout.Step) -> Steps:
+    outcome = step.outcome
+    return Steps(step.obs, step.extras, outcome.reward, outcome.terminated, outcome.truncated, outcome.obs)
+
+
+def _wait(train: Any, learner: Any) -> tuple[Any, dict[str, jax.Array]]:
+    """The learner as it is, and metrics without values, before learning starts."""
+    shapes = jax.eval_shape(train, learner)[1]
+    return learner, jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)

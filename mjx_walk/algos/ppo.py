@@ -1,33 +1,30 @@
-"""Proximal policy optimisation (Schulman et al. 2017) on Brax's networks and loss."""
+"""Proximal policy optimization (Schulman et al. 2017) on Brax's networks and loss."""
 
 import dataclasses
-import functools
+import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training.agents.ppo import losses as ppo_losses
 
-from mjx_walk.algos.on_policy import OnPolicyBatch, OnPolicyConfig, OnPolicyState, make_on_policy
-from mjx_walk.algos.on_policy_update import (
-    after_update,
-    learning_rates,
-    make_algorithm,
+from mjx_walk.algos.on_policy import (
+    OnPolicyAlgorithm,
+    OnPolicyBatch,
+    OnPolicyConfig,
+    OnPolicyState,
     require_several_gradient_steps,
-    require_whole_minibatches,
 )
-from mjx_walk.common import networks
-from mjx_walk.common.optimizers import apply_gradients
-from mjx_walk.common.schedules import factor
-from mjx_walk.envs import Task
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.common.brax_losses import make_ppo_loss
+from mjx_walk.common.optimizers import schedule_factor
+from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
-from mjx_walk.utils.types import Algorithm, Metrics
+from mjx_walk.utils.types import Metrics, as_means
 
 
 @dataclasses.dataclass
 class PPOConfig(OnPolicyConfig):
-    """Settings of PPO; the recipe of each task changes some of them."""
+    """Settings of PPO."""
 
     name: str = setting("ppo", choices=("ppo",))
     num_minibatches: int = setting(32, at_least=1)
@@ -35,41 +32,31 @@ class PPOConfig(OnPolicyConfig):
     clip_epsilon: float = setting(0.3, above=0)
 
 
-def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PPOConfig) -> Algorithm:
-    """Build PPO for a task.
-
-    Args:
-        task: the unbatched environment.
-        num_envs: copies that learn.
-        evaluation: of the policy beside them.
-        config: settings.
+@dataclasses.dataclass(frozen=True, eq=False)
+class PPO(OnPolicyAlgorithm):
+    """Several epochs of minibatches on Brax's clipped loss.
 
     Raises:
-        UserError: the batch does not divide into the minibatches; or see `require_several_gradient_steps`.
+        UserError: the batch cannot be split evenly into minibatches; or see `require_several_gradient_steps`.
     """
-    require_whole_minibatches(num_envs, config.num_unrolls, config.num_minibatches)
-    require_several_gradient_steps(config, config.num_epochs * config.num_minibatches)
-    ground = make_on_policy(task, num_envs, evaluation, config)
-    nets = ground.nets
 
-    def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
+    config: PPOConfig
+
+    def __post_init__(self) -> None:
+        _require_even_minibatches(self.num_envs, self.config.num_unrolls, self.config.num_minibatches)
+        require_several_gradient_steps(self.config, self.config.num_epochs * self.config.num_minibatches)
+        super().__post_init__()
+
+    def update(self, state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
+        config = self.config
         key, update_key = jax.random.split(state.key)
-        remaining = ground.remaining(state)
-        rates = learning_rates(config, state, remaining)
-        new_normalizer = networks.update_normalizer(state.normalizer, batch.transitions.observation)
+        remaining = self.remaining(state)
+        rates = self.learning_rates(state, remaining)
+        new_normalizer = self.update_normalizer(state, batch)
         # KL compares distributions under one normalizer, the one that acted.
         normalizer = state.normalizer if config.learning_rate_schedule == "adaptive_kl" else new_normalizer
-        loss_fn = functools.partial(
-            ppo_losses.compute_ppo_loss,
-            ppo_network=nets,
-            entropy_cost=config.entropy_coef * factor(config.entropy_schedule, remaining),
-            discounting=config.discount,
-            reward_scaling=batch.reward_scale,
-            gae_lambda=config.gae_lambda,
-            clipping_epsilon=config.clip_epsilon,
-            normalize_advantage=config.normalize_advantages,
-            vf_coefficient=config.value_loss_coef,
-        )
+        entropy_coef = config.entropy_coef * schedule_factor(config.entropy_schedule, remaining)
+        loss_fn = make_ppo_loss(self.nets, config, entropy_coef, batch.reward_scale)
 
         def minibatch(carry, rows):
             params, opt_state, key = carry
@@ -77,7 +64,7 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
             data = jax.tree.map(lambda x: x[rows], batch.transitions)
             grads, metrics = jax.grad(loss_fn, has_aux=True)(params, normalizer, data, loss_key)
             metrics["grad_norm"] = optax.global_norm(grads)
-            return (*apply_gradients(ground.optimizer, params, grads, opt_state, rates), key), metrics
+            return (*self.apply_gradients(params, grads, opt_state, rates), key), metrics
 
         def epoch(carry, _):
             params, opt_state, key = carry
@@ -90,20 +77,21 @@ def make_ppo(task: Task, num_envs: int, evaluation: EvaluationConfig, config: PP
         carry = (state.params, state.optimizer, update_key)
         (params, optimizer, _), metrics = jax.lax.scan(epoch, carry, length=config.num_epochs)
         kl = metrics["kl_mean"][-1, -1]
-        new_state = after_update(config, state, batch, params, optimizer, new_normalizer, kl, key)
+        new_state = self.finish_update(state, batch, params, optimizer, new_normalizer, kl, key)
         acted_with = batch.transitions.extras["policy_extras"]["distribution_params"]
-        # The entropy is only told, so it may borrow the next update's key.
-        return new_state, batch.stats | _loss_metrics(metrics) | {
-            "entropy": nets.parametric_action_distribution.entropy(acted_with, key).mean(),
-            "learning_rate": jnp.float32(rates.policy),
-            "reward_scale": batch.reward_scale,
-        }
+        return new_state, batch.metrics | as_means(
+            _loss_metrics(metrics)
+            | {
+                # Only logged, so it may reuse the key of the next iteration.
+                "entropy": self.nets.parametric_action_distribution.entropy(acted_with, key).mean(),
+                "learning_rate": jnp.float32(rates.policy),
+                "reward_scale": batch.reward_scale,
+            }
+        )
 
-    return make_algorithm(ground, learn)
 
-
-def _loss_metrics(metrics: Metrics) -> Metrics:
-    """Means over all minibatches, under our names."""
+def _loss_metrics(metrics: dict[str, Any]) -> dict[str, jax.Array]:
+    """Means of Brax's metrics over all minibatches, under our names."""
     names = {
         "total_loss": "loss",
         "policy_loss": "policy_loss",
@@ -113,3 +101,17 @@ def _loss_metrics(metrics: Metrics) -> Metrics:
         "grad_norm": "grad_norm",
     }
     return {new: metrics[old].mean() for old, new in names.items()}
+
+
+def _require_even_minibatches(num_envs: int, num_unrolls: int, num_minibatches: int) -> None:
+    """Check that the unrolls of a batch can be split evenly.
+
+    Raises:
+        UserError: they cannot.
+    """
+    if num_envs * num_unrolls % num_minibatches:
+        divisor = num_minibatches // math.gcd(num_minibatches, num_unrolls)
+        raise UserError(
+            f"num_envs={num_envs} times algo.num_unrolls={num_unrolls} must be a multiple of "
+            f"algo.num_minibatches={num_minibatches}; choose num_envs a multiple of {divisor}"
+        )

@@ -1,87 +1,90 @@
-"""REINFORCE (Williams 1992) for many copies: the policy gradient on returns as they came, without a value network."""
+"""REINFORCE (Williams 1992) for many environments: the policy gradient on observed returns, without a value network."""
 
 import dataclasses
 import functools
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from mjx_walk.algos.on_policy import OnPolicyBatch, OnPolicyState, make_on_policy
-from mjx_walk.algos.on_policy_update import make_algorithm
-from mjx_walk.algos.policy_gradient import PolicyGradientConfig, Samples, check_minibatches, learn_once, normalize
+from mjx_walk.algos.on_policy import OnPolicyBatch, OnPolicyState
+from mjx_walk.algos.policy_gradient import PolicyGradientAlgorithm, PolicyGradientConfig, Samples, normalize
 from mjx_walk.common import returns
-from mjx_walk.envs import Task
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
-from mjx_walk.utils.types import Algorithm, Metrics
+from mjx_walk.utils.types import Metrics, as_means
 
 
 @dataclasses.dataclass
 class REINFORCEConfig(PolicyGradientConfig):
-    """Settings of REINFORCE; the recipe of each task changes some of them. Those for advantages and values do nothing
-    here."""
+    """Settings of REINFORCE. Those of advantages and values have no effect."""
 
     name: str = setting("reinforce", choices=("reinforce",))
     unroll_length: int = setting(256, at_least=1)
     max_tail_discount: float = setting(0.05, above=0, at_most=1)
-    """A step is learned from if its piece goes on until what follows counts at most this much."""
+    """A step is used only if the discount on its unobserved tail is at most this."""
     baseline: str = setting("linear", choices=("mean", "linear"))
-    """What returns are compared with: the batch's mean, or what a linear fit to the batch expects of an observation."""
+    """Subtracted from returns: the mean of the batch, or a linear fit of its returns to its observations."""
 
 
-def make_reinforce(task: Task, num_envs: int, evaluation: EvaluationConfig, config: REINFORCEConfig) -> Algorithm:
-    """Build REINFORCE for a task.
+@dataclasses.dataclass(frozen=True, eq=False)
+class REINFORCE(PolicyGradientAlgorithm):
+    """The policy gradient on discounted returns.
 
-    Deviation: a copy does not wait for the others' episodes to end. A batch is a piece of `unroll_length` steps, of
-    which the first are learned from: those after which it goes on until what follows is discounted away
-    (`max_tail_discount`). Whether a step's episode ended within the piece makes no difference, or falls would be
-    learned from more often than
-    what prevents them.
-
-    Args:
-        task: the unbatched environment.
-        num_envs: copies that learn.
-        evaluation: of the policy beside them.
-        config: settings.
+    Deviation: environments do not wait for each other's episodes to end. A batch is one unroll of `unroll_length`
+    steps, and only its first steps are used: those whose return is known but for a tail that is discounted away
+    (`max_tail_discount`). Whether an episode ends within the unroll makes no difference, or falls would be learned from
+    more often than what prevents them.
 
     Raises:
-        UserError: see `check_minibatches`; or the pieces are too short to learn from.
+        UserError: the unrolls are too short to learn from; or see `PolicyGradientAlgorithm`.
     """
-    unseen_after_piece = [config.discount ** (config.unroll_length - step) for step in range(config.unroll_length)]
-    num_learned = sum(unseen <= config.max_tail_discount for unseen in unseen_after_piece)
-    if num_learned == 0:
-        raise UserError(
-            f"algo.unroll_length={config.unroll_length}: at its first step, what follows a piece counts "
-            f"{unseen_after_piece[0]:.2f}, above algo.max_tail_discount={config.max_tail_discount}; "
-            "lengthen it, or lower algo.discount"
-        )
-    check_minibatches(num_envs * config.num_unrolls * num_learned, config)
-    ground = make_on_policy(task, num_envs, evaluation, config, has_value=False)
 
-    def no_value_loss(*_) -> tuple[jax.Array, Metrics]:
-        return jnp.float32(0.0), {}
+    has_value: ClassVar[bool] = False
 
-    def learn(state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
+    config: REINFORCEConfig
+    num_learned: int = dataclasses.field(init=False)
+    """Steps of an unroll that are learned from."""
+
+    def __post_init__(self) -> None:
+        config = self.config
+        tail_discounts = [config.discount ** (config.unroll_length - step) for step in range(config.unroll_length)]
+        self._set(num_learned=sum(tail <= config.max_tail_discount for tail in tail_discounts))
+        if self.num_learned == 0:
+            raise UserError(
+                f"algo.unroll_length={config.unroll_length}: the tail after an unroll has a discount of "
+                f"{tail_discounts[0]:.2f} at its first step, above algo.max_tail_discount={config.max_tail_discount}; "
+                "lengthen it, or lower algo.discount"
+            )
+        super().__post_init__()
+
+    @property
+    def num_learned_steps(self) -> int:
+        return self.num_envs * self.config.num_unrolls * self.num_learned
+
+    def samples(self, state: OnPolicyState, batch: OnPolicyBatch) -> Samples:
         data = batch.transitions
-        return_to_go, unseen = returns.returns_to_go(
+        return_to_go, tail_discount = returns.returns_to_go(
             data.reward.T,
             data.discount.T == 0.0,
             data.extras["state_extras"]["truncation"].T > 0.0,
-            config.discount,
+            self.config.discount,
         )
-        # Of these steps, only those before a time limit can have too much unseen.
-        weight = jnp.float32(config.max_tail_discount >= unseen.T[:, :num_learned])
-        advantage, obs = return_to_go.T[:, :num_learned], data.observation[:, :num_learned]
+        used = slice(0, self.num_learned)
+        # Of these steps, only those before a time limit can have too large a tail.
+        weight = jnp.float32(self.config.max_tail_discount >= tail_discount.T[:, used])
+        advantage, obs = return_to_go.T[:, used], data.observation[:, used]
         advantage = normalize(advantage, weight)
-        if config.baseline == "linear":
+        if self.config.baseline == "linear":
             advantage = normalize(advantage - linear_fit(obs, advantage, weight), weight)
-        acted = jax.tree.map(lambda x: x[:, :num_learned], data.extras["policy_extras"])
-        samples = Samples(obs, acted["raw_action"], acted["log_prob"], advantage, weight, target=())
-        new_state, metrics = learn_once(ground, config, state, batch, samples, no_value_loss)
-        return new_state, metrics | {"learned_from": weight.mean() * num_learned / config.unroll_length}
+        acted = jax.tree.map(lambda x: x[:, used], data.extras["policy_extras"])
+        return Samples(obs, acted["raw_action"], acted["log_prob"], advantage, weight, target=())
 
-    return make_algorithm(ground, learn)
+    def update(self, state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
+        samples = self.samples(state, batch)
+        new_state, metrics = self.learn_once(state, batch, samples)
+        learned_from = samples.weight.mean() * self.num_learned / self.config.unroll_length
+        return new_state, metrics | as_means({"learned_from": learned_from})
 
 
 _LARGEST = 5.0

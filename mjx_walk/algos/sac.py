@@ -1,7 +1,6 @@
 """Soft actor-critic (Haarnoja et al. 2018) on Brax's networks and losses."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import flax
@@ -9,18 +8,13 @@ import jax
 import jax.numpy as jnp
 import optax
 from brax.training import types as brax_types
-from brax.training.agents.sac import losses as sac_losses
 from brax.training.agents.sac.networks import SACNetworks
 
-from mjx_walk.algos.off_policy import Batch, Learner, OffPolicyConfig, make_off_policy
+from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm, OffPolicyConfig
 from mjx_walk.common import networks
-from mjx_walk.common.optimizers import apply_gradients, make_adam, move_towards
-from mjx_walk.envs import Task
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.common.brax_losses import SACLosses, make_sac_losses
+from mjx_walk.common.optimizers import apply_gradients, make_adam, polyak_update
 from mjx_walk.utils.settings import setting
-from mjx_walk.utils.types import Algorithm, Metrics
-
-MakeCriticLoss = Callable[[jax.Array], Callable[..., jax.Array]]
 
 
 @dataclasses.dataclass
@@ -50,92 +44,90 @@ class SACState(flax.struct.PyTreeNode):
     alpha_optimizer: optax.OptState
 
 
-def make_sac(task: Task, num_envs: int, evaluation: EvaluationConfig, config: SACConfig) -> Algorithm:
-    """Build SAC for a task; see `make_off_policy`."""
-    return make_off_policy(task, num_envs, evaluation, config, make_sac_learner(task, config))
+@dataclasses.dataclass(frozen=True, eq=False)
+class SAC(OffPolicyAlgorithm):
+    """Source: `sgd_step` of Brax's SAC: temperature, critic and policy take their gradients at the same parameters."""
 
+    config: SACConfig
+    nets: SACNetworks = dataclasses.field(init=False, repr=False)
+    optimizer: optax.GradientTransformation = dataclasses.field(init=False, repr=False)
 
-def make_sac_learner(
-    task: Task, config: SACConfig, nets: SACNetworks | None = None, make_critic_loss: MakeCriticLoss | None = None
-) -> Learner:
-    """SAC's networks and updates.
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set(nets=self.make_networks(), optimizer=make_adam(self.config.max_grad_norm))
 
-    Source: `sgd_step` of Brax's SAC: temperature, critic and policy take their gradients at the same, old parameters.
+    def make_networks(self) -> SACNetworks:
+        """Policy and critics."""
+        return networks.make_sac_networks(self.task, self.config)
 
-    Args:
-        task: gives the sizes.
-        config: settings.
-        nets: other networks than Brax's.
-        make_critic_loss: another loss than Brax's, given the reward scale; called as Brax's is.
-    """
-    nets = nets or networks.make_sac_networks(task, config)
-    optimizer = make_adam(config.max_grad_norm)
-    last_entropy = config.target_entropy if config.final_target_entropy is None else config.final_target_entropy
-
-    def losses(batch: Batch):
-        entropy = last_entropy + (config.target_entropy - last_entropy) * batch.remaining
-        # Brax's only use of the size is a target entropy of -0.5 nats for each action dimension.
-        entropy_size = -2.0 * entropy * task.action_size
-        # γ is in the batch's discounts.
-        return sac_losses.make_losses(nets, batch.reward_scale, discounting=1.0, action_size=entropy_size)
-
-    def init(key: jax.Array) -> SACState:
+    def init_learner(self, key: jax.Array) -> SACState:
         policy_key, critic_key = jax.random.split(key)
-        policy, critic = nets.policy_network.init(policy_key), nets.q_network.init(critic_key)
-        log_alpha = jnp.log(jnp.float32(config.init_alpha))
+        policy, critic = self.nets.policy_network.init(policy_key), self.nets.q_network.init(critic_key)
+        log_alpha = jnp.log(jnp.float32(self.config.init_alpha))
         return SACState(
             policy=policy,
             critic=critic,
             target_critic=critic,
             log_alpha=log_alpha,
-            policy_optimizer=optimizer.init(policy),
-            critic_optimizer=optimizer.init(critic),
-            alpha_optimizer=optimizer.init(log_alpha),
+            policy_optimizer=self.optimizer.init(policy),
+            critic_optimizer=self.optimizer.init(critic),
+            alpha_optimizer=self.optimizer.init(log_alpha),
         )
 
-    def act(policy_params: Any, obs: jax.Array, key: jax.Array, deterministic: bool = False) -> jax.Array:
-        logits = nets.policy_network.apply(None, policy_params, obs)
-        distribution = nets.parametric_action_distribution
+    def act(self, params: Any, obs: jax.Array, key: jax.Array, deterministic: bool) -> jax.Array:
+        logits = self.nets.policy_network.apply(None, params, obs)
+        distribution = self.nets.parametric_action_distribution
         return distribution.mode(logits) if deterministic else distribution.sample(logits, key)
 
-    def critic_update(state: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, Metrics]:
-        _, critic_loss, _ = losses(batch)
-        if make_critic_loss:
-            critic_loss = make_critic_loss(batch.reward_scale)
-        loss, grads = jax.value_and_grad(critic_loss)(
-            state.critic,
-            state.policy,
-            None,
-            state.target_critic,
-            jnp.exp(state.log_alpha),
-            batch.transitions,
-            key,
+    def explore(self, params: Any, obs: jax.Array, key: jax.Array) -> jax.Array:
+        return self.act(params, obs, key, deterministic=False)
+
+    def losses(self, batch: Batch) -> SACLosses:
+        """Brax's losses, with the target entropy of the moment."""
+        first, last = self.config.target_entropy, self.config.final_target_entropy
+        last = first if last is None else last
+        target_entropy = last + (first - last) * batch.remaining
+        return make_sac_losses(self.nets, batch.reward_scale, target_entropy, self.task.action_size)
+
+    def critic_loss(self, critic: Any, learner: SACState, batch: Batch, key: jax.Array) -> jax.Array:
+        """The loss of the critics, `[] f32`."""
+        alpha = jnp.exp(learner.log_alpha)
+        return self.losses(batch).critic(critic, learner.policy, learner.target_critic, alpha, batch.transitions, key)
+
+    def critic_update(self, learner: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, dict[str, jax.Array]]:
+        loss, grads = jax.value_and_grad(self.critic_loss)(learner.critic, learner, batch, key)
+        rate = self.config.critic_learning_rate * batch.rate_factor
+        critic, critic_optimizer = apply_gradients(
+            self.optimizer, learner.critic, grads, learner.critic_optimizer, rate, self.axis_name
         )
-        rate = config.critic_learning_rate * batch.rate_factor
-        critic, critic_optimizer = apply_gradients(optimizer, state.critic, grads, state.critic_optimizer, rate)
-        new_state = state.replace(
+        new_learner = learner.replace(
             critic=critic,
             critic_optimizer=critic_optimizer,
-            target_critic=move_towards(state.target_critic, critic, config.tau),
+            target_critic=polyak_update(learner.target_critic, critic, self.config.tau),
         )
-        return new_state, {"critic_loss": loss, "critic_grad_norm": optax.global_norm(grads)}
+        return new_learner, {"critic_loss": loss, "critic_grad_norm": optax.global_norm(grads)}
 
-    def full_update(state: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, Metrics]:
+    def full_update(self, learner: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, dict[str, jax.Array]]:
+        config, losses = self.config, self.losses(batch)
         alpha_key, critic_key, policy_key = jax.random.split(key, 3)
-        alpha_loss, _, policy_loss = losses(batch)
-        alpha_grad = jax.grad(alpha_loss)(state.log_alpha, state.policy, None, batch.transitions, alpha_key)
-        loss, grads = jax.value_and_grad(policy_loss)(
-            state.policy, None, state.critic, jnp.exp(state.log_alpha), batch.transitions, policy_key
+        alpha_grad = jax.grad(losses.temperature)(learner.log_alpha, learner.policy, batch.transitions, alpha_key)
+        loss, grads = jax.value_and_grad(losses.policy)(
+            learner.policy, learner.critic, jnp.exp(learner.log_alpha), batch.transitions, policy_key
         )
-        new_state, metrics = critic_update(state, batch, critic_key)
+        new_learner, metrics = self.critic_update(learner, batch, critic_key)
         log_alpha, alpha_optimizer = apply_gradients(
-            optimizer, state.log_alpha, alpha_grad, state.alpha_optimizer, config.alpha_learning_rate
+            self.optimizer,
+            learner.log_alpha,
+            alpha_grad,
+            learner.alpha_optimizer,
+            config.alpha_learning_rate,
+            self.axis_name,
         )
         rate = config.policy_learning_rate * batch.rate_factor
-        policy, policy_optimizer = apply_gradients(optimizer, state.policy, grads, state.policy_optimizer, rate)
-        new_state = new_state.replace(
+        policy, policy_optimizer = apply_gradients(
+            self.optimizer, learner.policy, grads, learner.policy_optimizer, rate, self.axis_name
+        )
+        new_learner = new_learner.replace(
             policy=policy, policy_optimizer=policy_optimizer, log_alpha=log_alpha, alpha_optimizer=alpha_optimizer
         )
-        return new_state, metrics | {"policy_loss": loss, "alpha": jnp.exp(log_alpha)}
-
-    return Learner(init, lambda state: state.policy, act, act, critic_update, full_update)
+        return new_learner, metrics | {"policy_loss": loss, "alpha": jnp.exp(log_alpha)}

@@ -15,7 +15,6 @@ from brax.training.distribution import NormalDistribution, NormalTanhDistributio
 from brax.training.networks import ACTIVATION
 
 from mjx_walk.envs import Task
-from mjx_walk.utils import collectives
 from mjx_walk.utils.errors import UserError
 
 MIN_OBSERVATION_STD = 1e-4
@@ -173,12 +172,10 @@ def init_normalizer(observation_size: int) -> running_statistics.RunningStatisti
 
 
 def update_normalizer(
-    normalizer: running_statistics.RunningStatisticsState, obs: jax.Array
+    normalizer: running_statistics.RunningStatisticsState, obs: jax.Array, axis_name: str | None = None
 ) -> running_statistics.RunningStatisticsState:
-    """Take `[…, observation_size]` observations, of all devices, into the running statistics."""
-    return running_statistics.update(
-        normalizer, obs, std_min_value=MIN_OBSERVATION_STD, pmap_axis_name=collectives.axis()
-    )
+    """Add `[…, observation_size]` observations, those of all devices, to the running statistics."""
+    return running_statistics.update(normalizer, obs, std_min_value=MIN_OBSERVATION_STD, pmap_axis_name=axis_name)
 
 
 def to_env_action(task: Task, action: jax.Array) -> jax.Array:

@@ -1,32 +1,75 @@
-"""Adam with a learning rate that the learner hands in at every step."""
+"""Adam whose learning rate is an argument of every step, and schedules over environment steps."""
 
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import optax
 
 from mjx_walk.utils import collectives
 
 
 def make_adam(max_grad_norm: float | None = None) -> optax.GradientTransformation:
-    """Adam without its learning rate, which `apply_gradients` applies, after clipping by the global norm if asked."""
+    """Adam without a learning rate, which `apply_gradients` takes; gradients are clipped by global norm if asked."""
     if max_grad_norm is None:
         return optax.scale_by_adam()
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.scale_by_adam())
 
 
 def apply_gradients(
-    optimizer: optax.GradientTransformation, params: Any, grads: Any, state: optax.OptState, rate: Any
+    optimizer: optax.GradientTransformation,
+    params: Any,
+    grads: Any,
+    state: optax.OptState,
+    learning_rate: Any,
+    axis_name: str | None,
 ) -> tuple[Any, optax.OptState]:
-    """One step down the gradient, its mean over the devices: `(params, optimizer state)` after it.
+    """One gradient step.
 
-    `rate` is one for all parameters, or a tree of them whose leaves stand for subtrees of `params`.
+    Args:
+        optimizer: from `make_adam`.
+        params: parameters.
+        grads: their gradients, averaged over the devices.
+        state: optimizer state.
+        learning_rate: one for all parameters, or a tree whose leaves stand for subtrees of `params`.
+        axis_name: mapped axis over devices, if there is one.
+
+    Returns:
+        Parameters and optimizer state after the step.
     """
-    updates, state = optimizer.update(collectives.mean(grads), state)
-    steps = jax.tree.map(lambda rate, part: jax.tree.map(lambda u: -rate * u, part), rate, updates)
+    updates, state = optimizer.update(collectives.mean(grads, axis_name), state)
+    steps = jax.tree.map(lambda rate, part: jax.tree.map(lambda u: -rate * u, part), learning_rate, updates)
     return optax.apply_updates(params, steps), state
 
 
-def move_towards(target: Any, params: Any, tau: float) -> Any:
-    """Polyak averaging: `(1 − τ) target + τ params`."""
+def polyak_update(target: Any, params: Any, tau: float) -> Any:
+    """`(1 − τ) target + τ params`."""
     return jax.tree.map(lambda t, p: (1.0 - tau) * t + tau * p, target, params)
+
+
+def remaining_fraction(steps: jax.Array, horizon: int) -> jax.Array:
+    """The fraction of a schedule that is left: 1 at the start, linearly to 0 at `horizon` steps, then 0."""
+    return jnp.clip(1.0 - steps / horizon, 0.0, 1.0)
+
+
+def schedule_factor(schedule: str, remaining: jax.Array) -> jax.Array | float:
+    """The factor that a schedule gives a setting: 1 if it is `constant`, else the fraction that is left."""
+    return 1.0 if schedule == "constant" else remaining
+
+
+def anneal_discount(first: float, last: float | None, remaining: jax.Array) -> jax.Array | float:
+    """A discount whose horizon 1 / (1 - γ) moves geometrically from the first to the last; constant without a last."""
+    if last is None:
+        return first
+    return 1.0 - (1.0 - first) ** remaining * (1.0 - last) ** (1.0 - remaining)
+
+
+def adapt_rate(rate: jax.Array, kl: jax.Array, target: float) -> jax.Array:
+    """The learning rate that keeps the policy's KL from the acting policy near a target.
+
+    Source: rsl_rl: ÷ 1.5 above twice the target, × 1.5 below half of it. Deviations: once a batch, not at each
+    minibatch; bounds of 1e-6, not 1e-5, and 1e-2.
+    """
+    slower = jnp.where(kl > 2.0 * target, rate / 1.5, rate)
+    faster = jnp.where((kl < 0.5 * target) & (kl > 0.0), slower * 1.5, slower)
+    return jnp.clip(faster, 1e-6, 1e-2)

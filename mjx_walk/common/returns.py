@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_walk.utils import collectives
+from mjx_walk.utils.types import PER_DEVICE
 
 
 def bootstrap_truncated(
@@ -78,7 +79,7 @@ class ReturnScale(flax.struct.PyTreeNode):
     Source: `VecNormalize` of Stable-Baselines3 (`r / std(G)`, with `G ← γ G + r` running through each copy).
     """
 
-    running_return: jax.Array
+    running_return: jax.Array = flax.struct.field(metadata=PER_DEVICE)
     """`[B] f32`."""
     count: jax.Array
     mean: jax.Array
@@ -93,9 +94,13 @@ def init_return_scale(num_envs: int) -> ReturnScale:
 
 
 def update_return_scale(
-    scale: ReturnScale, reward: jax.Array, done: jax.Array, discount: jax.Array | float
+    scale: ReturnScale,
+    reward: jax.Array,
+    done: jax.Array,
+    discount: jax.Array | float,
+    axis_name: str | None = None,
 ) -> ReturnScale:
-    """Take a chronological `[T, B]` block of rewards, on each device its own, into the running variance."""
+    """Add a chronological `[T, B]` block of rewards, one on each device, to the running variance."""
 
     def advance(running, inputs):
         reward, done = inputs
@@ -103,15 +108,15 @@ def update_return_scale(
         return jnp.where(done, 0.0, running), running
 
     running, returns = jax.lax.scan(advance, scale.running_return, (reward, done))
-    batch_count = collectives.total(jnp.float32(returns.size))
-    batch_mean = collectives.mean(returns.mean())
-    batch_variance = collectives.mean(jnp.square(returns - batch_mean).mean())
+    batch_count = collectives.total(jnp.float32(returns.size), axis_name)
+    batch_mean = collectives.mean(returns.mean(), axis_name)
+    batch_variance = collectives.mean(jnp.square(returns - batch_mean).mean(), axis_name)
     count = scale.count + batch_count
     delta = batch_mean - scale.mean
     mean = scale.mean + delta * batch_count / count
     squares = scale.variance * scale.count + batch_variance * batch_count
     variance = (squares + delta**2 * scale.count * batch_count / count) / count
-    largest = jnp.maximum(scale.largest, collectives.largest(jnp.abs(returns).max()))
+    largest = jnp.maximum(scale.largest, collectives.largest(jnp.abs(returns).max(), axis_name))
     return ReturnScale(running, count, mean, variance, largest)
 
 

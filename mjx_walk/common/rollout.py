@@ -1,4 +1,4 @@
-"""Run a policy: collect training data, or evaluate."""
+"""Run a policy: collect training data, or play whole episodes."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -7,15 +7,16 @@ import jax
 import jax.numpy as jnp
 
 from mjx_walk.envs import Task
+from mjx_walk.envs.inline_evaluation import InlineEvaluation
 from mjx_walk.envs.vector_env import Outcome, VectorEnv, VectorState
 from mjx_walk.utils.types import Metrics, PolicyFn
 
 Actor = Callable[[jax.Array, Any], tuple[jax.Array, Any]]
-"""`(obs [B, …], key or more) → (action [B, action_size] in Gymnasium's units, extras)`."""
+"""`(obs [B, …], inputs of the step) → (action [B, action_size] in Gymnasium's units, extras)`."""
 
 
 class Step(NamedTuple):
-    """One step of all copies, `[B, …]`; stacked over time, `[T, B, …]`."""
+    """One step of all environments, `[B, …]`; stacked over time, `[T, B, …]`."""
 
     obs: jax.Array
     action: jax.Array
@@ -26,41 +27,44 @@ class Step(NamedTuple):
 def unroll(
     env: VectorEnv,
     state: VectorState,
+    evaluation: InlineEvaluation,
     actor: Actor,
-    keys: Any,
+    inputs: Any,
     keep: Callable[[Step], Any],
-) -> tuple[VectorState, Any, Metrics]:
-    """Step all copies T times.
+) -> tuple[VectorState, InlineEvaluation, Any, Metrics]:
+    """Step all environments T times.
 
     Args:
-        env: the copies.
-        state: where they are.
+        env: the environments.
+        state: their state.
+        evaluation: the inline evaluation, stepped with them.
         actor: chooses actions.
-        keys: `[T]` random keys, or a tree of `[T, …]`, for the actor.
+        inputs: `[T]` random keys, or a tree of `[T, …]`, for the actor.
         keep: what of each step to store; whatever it drops takes no memory.
 
     Returns:
-        The copies' next state; what was kept, `[T, B, …]`; and the sums of `VectorEnv.step` over all steps.
+        The next state and evaluation; what was kept, `[T, B, …]`; and the metrics of `VectorEnv.step`, summed.
     """
 
-    def one(state, key):
+    def one(carry, step_inputs):
+        state, evaluation = carry
         obs = state.env.obs
-        action, extras = actor(obs, key)
-        state, outcome, stats = env.step(state, action)
-        return state, (keep(Step(obs, action, outcome, extras)), stats)
+        action, extras = actor(obs, step_inputs)
+        state, evaluation, outcome, metrics = env.step(state, evaluation, action)
+        return (state, evaluation), (keep(Step(obs, action, outcome, extras)), metrics)
 
-    state, (kept, stats) = jax.lax.scan(one, state, keys)
-    return state, kept, jax.tree.map(lambda x: x.sum(0), stats)
+    (state, evaluation), (kept, metrics) = jax.lax.scan(one, (state, evaluation), inputs)
+    return state, evaluation, kept, jax.tree.map(lambda x: x.sum(0), metrics)
 
 
 def evaluate(task: Task, num_episodes: int, policy: PolicyFn, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Whole episodes, side by side.
+    """Play whole episodes in one batch.
 
     Args:
         task: the unbatched environment.
         num_episodes: B.
         policy: usually deterministic.
-        key: starts and, if the policy draws, actions.
+        key: for the starts and, if the policy samples, the actions.
 
     Returns:
         Undiscounted returns `[B] f32` and lengths `[B] i32`.
@@ -75,8 +79,8 @@ def evaluate(task: Task, num_episodes: int, policy: PolicyFn, key: jax.Array) ->
         lengths += alive
         return (state, alive & ~state.terminated, returns, lengths), None
 
-    none = jnp.zeros(num_episodes, jnp.float32)
-    carry = (start, jnp.ones(num_episodes, bool), none, none.astype(jnp.int32))
+    zeros = jnp.zeros(num_episodes, jnp.float32)
+    carry = (start, jnp.ones(num_episodes, bool), zeros, zeros.astype(jnp.int32))
     keys = jax.random.split(run_key, task.options.max_episode_steps)
     (_, _, returns, lengths), _ = jax.lax.scan(one, carry, keys)
     return returns, lengths

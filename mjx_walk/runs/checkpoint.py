@@ -31,8 +31,10 @@ _REPLAY = "replay"
 _RENAMED_LEAVES = {
     "updates": "iterations",
     "env.is_whole": "env.started_at_reset",
-    "env.live.snapshot_update": "env.live.snapshot_iteration",
-    "env.live.best_update": "env.live.best_iteration",
+    "env.live.snapshot_update": "evaluation.snapshot_iteration",
+    "env.live.best_update": "evaluation.best_iteration",
+    "env.live": "evaluation",
+    "noise": "exploration",
 }
 """Leaves by their former paths, which older checkpoints hold."""
 

@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import os
 import warnings
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -140,7 +141,7 @@ def complete_overrides(overrides: list[str]) -> list[str]:
             continue
         if override.is_add() or override.is_force_add() or override.is_delete():
             raise UserError(f"'{override.input_line}': keys cannot be added or removed; write {key}=VALUE")
-        known = {"env": TASKS, "algo": ALGORITHMS}.get(key)
+        known: Collection[str] | None = {"env": TASKS.keys(), "algo": ALGORITHMS.keys()}.get(key)
         if known and not override.is_sweep_override() and override.value() not in known:
             raise UserError(f"unknown {key} '{override.value()}'; choose one of: {', '.join(known)}")
     overrides = [_as_text(override) for override in parsed]

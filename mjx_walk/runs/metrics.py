@@ -7,54 +7,48 @@ from pathlib import Path
 
 import numpy as np
 
-from mjx_walk.utils.types import Metrics
+from mjx_walk.utils.types import Metrics, Reduction
 
 Row = dict[str, float]
 """One line of `metrics.jsonl`; see `name_metrics` for the names."""
 
-_SUMS = ("nonfinite", "overflow", "resets", "resets_reused")
 _MANY = 0.01
-"""The share of steps that are not finite from which on it is no rare accident of the physics."""
+"""The fraction of non-finite steps above which they are no rare accident of the physics."""
 
 
-def is_sum(name: str, reward_terms: tuple[str, ...]) -> bool:
-    """Whether a metric of an update is a sum over the copies."""
-    return name in ("episodes", "return", "length", *_SUMS, *reward_terms)
-
-
-def name_metrics(metrics: Metrics, reward_terms: tuple[str, ...], steps_per_iteration: int) -> Row:
-    """Turn the metrics of one chunk into a log row.
+def name_metrics(metrics: Metrics, steps_per_iteration: int) -> Row:
+    """Turn the metrics of one call into a log row.
 
     Args:
-        metrics: `[updates] f32` each: the sums of `VectorEnv.step`, and the learner's means.
-        reward_terms: which of them are reward terms.
-        steps_per_iteration: environment steps of an update.
+        metrics: `[iterations] f32` each: those of `VectorEnv.step` and `InlineEvaluator`, and the learner's.
+        steps_per_iteration: environment steps of an iteration, over all devices.
 
     Returns:
         `episode/…`: means over the episodes that ended (absent if none did); `physics/…` and `resets/…`: counts;
-        `train/…`: the learner's; and if an evaluation has ended, `eval/…`, with the steps behind the policy that
-        was evaluated as `eval/env_steps`.
+        `train/…`: the learner's, absent without a value; and `eval/…` if an evaluation has ended, with the environment
+        steps before its policy as `eval/env_steps`.
     """
-    values = {name: np.asarray(value, np.float64) for name, value in metrics.items()}
-    episodes = values.pop("episodes").sum()
-    row: Row = {"episode/count": float(episodes)}
-    for name in ("return", "length", *reward_terms):
-        total = values.pop(name).sum()
-        if episodes:
-            row[f"episode/{name}"] = float(total / episodes)
-    counts = {name: float(values.pop(name).sum()) for name in _SUMS}
+    by_reduction: dict[Reduction, dict[str, np.ndarray]] = {reduction: {} for reduction in Reduction}
+    for name, metric in metrics.items():
+        by_reduction[metric.reduction][name] = np.asarray(metric.value, np.float64)
+    counts = {name: float(value.sum()) for name, value in by_reduction[Reduction.SUM].items()}
+    episodes = counts["episodes"]
+    row: Row = {"episode/count": episodes}
+    if episodes:
+        sums = by_reduction[Reduction.PER_EPISODE]
+        row |= {f"episode/{name}": float(value.sum() / episodes) for name, value in sums.items()}
     row["physics/nonfinite"] = counts["nonfinite"]
     row["physics/overflow"] = counts["overflow"]
     row["resets/count"] = counts["resets"]
     row["resets/reuse_rate"] = counts["resets_reused"] / max(counts["resets"], 1.0)
-    scores = {name: values.pop(f"eval_{name}") for name in ("return", "return_std", "length", "iteration")}
+    scores = {name.removeprefix("eval_"): value for name, value in by_reduction[Reduction.FIRST_DEVICE].items()}
     ended = np.flatnonzero(~np.isnan(scores["return"]))
     if ended.size:
         last = {name: float(value[ended[-1]]) for name, value in scores.items()}
         row["eval/env_steps"] = last.pop("iteration") * steps_per_iteration
         row |= {f"eval/{name}": value for name, value in last.items()}
-    # Over the updates that have it: nothing is learned from a first batch, or before a replay is filled.
-    known = {name: value[~np.isnan(value)] for name, value in values.items()}
+    # Nothing is learned from the first batches, or before the replay holds enough.
+    known = {name: value[~np.isnan(value)] for name, value in by_reduction[Reduction.MEAN].items()}
     return row | {f"train/{name}": float(value.mean()) for name, value in known.items() if value.size}
 
 

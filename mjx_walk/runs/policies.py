@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_walk.algos import make_algorithm
+from mjx_walk.algos import Algorithm, make_algorithm
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.envs.rewards import reward_file
@@ -16,7 +16,6 @@ from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config, read_config
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.types import Algorithm
 
 
 class SavedPolicy:

@@ -1,4 +1,4 @@
-"""Checkpoints of a run on several devices: the first one's where a run on one has them, the others' beside it."""
+"""Checkpoints of a run on several devices: the main process's in the run's folder, the others' in subfolders."""
 
 from pathlib import Path
 from typing import Any
@@ -6,52 +6,49 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mjx_walk.algos import TrainState
 from mjx_walk.runs import checkpoint
-from mjx_walk.training.distributed import Team
-from mjx_walk.utils.types import TrainState
+from mjx_walk.training.distributed import Processes
+from mjx_walk.utils.types import has_mark
 
 NUM_DEVICES = "num_devices"
-"""Beside a checkpoint: how many there were."""
-_KEYS = ("key", "noise_key")
+"""Key of a checkpoint's facts: the number of devices that saved it."""
 
 
-def device_folder(checkpoints: Path, rank: int) -> Path:
-    """Where the checkpoints of a device lie."""
-    return checkpoints / f"device_{rank}" if rank else checkpoints
+def device_folder(checkpoints: Path, process_index: int) -> Path:
+    """The folder of a device's checkpoints."""
+    return checkpoints / f"device_{process_index}" if process_index else checkpoints
 
 
-def restore_newest(checkpoints: Path, like: TrainState, team: Team | None) -> tuple[TrainState, dict[str, Any]]:
-    """The newest checkpoint of which all devices' parts are whole, on as many devices as there are now.
+def restore_newest(checkpoints: Path, like: TrainState, processes: Processes) -> tuple[TrainState, dict[str, Any]]:
+    """The newest checkpoint that is complete on all devices, for as many devices as there are now.
 
-    Where there were fewer before, those that are new begin with a copy of what another one had, under keys of their
-    own; where there were more, theirs is left.
+    A device that joins starts with a copy of another one's part, under random keys of its own. The parts of devices
+    that left stay unused.
 
     Raises:
         UserError: there is none, or it belongs to another run.
     """
-    rank, size = (team.rank, team.size) if team else (0, 1)
+    index, count = processes.process_index, processes.process_count
 
     def part(path: Path) -> Path:
-        before = checkpoint.read_meta(path).get(NUM_DEVICES, 1)
-        return device_folder(checkpoints, rank % before) / path.name
+        former_count = checkpoint.read_meta(path).get(NUM_DEVICES, 1)
+        return device_folder(checkpoints, index % former_count) / path.name
 
     def agree(is_complete: bool) -> bool:
-        return all(team.gather(is_complete)) if team else is_complete
+        return all(processes.all_gather(is_complete))
 
     state, facts = checkpoint.restore_newest(checkpoints, like, part, agree)
-    before = facts.get(NUM_DEVICES, 1)
-    if rank >= before:
-        keys = {name: jax.random.fold_in(getattr(state, name), rank) for name in _KEYS if hasattr(state, name)}
-        state = state.replace(**keys)
-    return (_recount(state, before, size) if before != size else state), facts
+    former_count = facts.get(NUM_DEVICES, 1)
+    if index >= former_count:
+        is_key = has_mark(state, "random_key")
+        state = jax.tree.map(lambda mark, x: jax.random.fold_in(x, index) if mark else x, is_key, state)
+    if former_count != count:
+        state = _rescale_counts(state, former_count, count)
+    return state, facts
 
 
-def _recount(state: TrainState, before: int, size: int) -> TrainState:
-    """Counts of updates, of which a number of steps is fewer the more devices there are."""
-
-    def scaled(updates: jax.Array) -> jax.Array:
-        return jnp.int32(updates * before // size)
-
-    live = state.env.live
-    live = live.replace(snapshot_iteration=scaled(live.snapshot_iteration), best_iteration=scaled(live.best_iteration))
-    return state.replace(iterations=scaled(state.iterations), env=state.env.replace(live=live))
+def _rescale_counts(state: TrainState, former_count: int, count: int) -> TrainState:
+    """Iteration counts for another number of devices: the more devices, the fewer iterations for the same steps."""
+    is_count = has_mark(state, "iteration_count")
+    return jax.tree.map(lambda mark, x: jnp.int32(x * former_count // count) if mark else x, is_count, state)

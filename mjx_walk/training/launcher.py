@@ -1,4 +1,4 @@
-"""`devices=N`: a process for each GPU of this host, which make up a `Team`."""
+"""`devices=N`: one process for each GPU of this host, which train one run together."""
 
 import os
 import signal
@@ -72,7 +72,7 @@ def _start(arguments: list[str], size: int, logs: Path) -> list[subprocess.Popen
         coordinator = f"localhost:{free.getsockname()[1]}"
     processes = []
     for rank in range(size):
-        env = os.environ | {"MJX_WALK_TEAM": f"{rank},{size},{coordinator}"} | only_device(rank)
+        env = os.environ | {"MJX_WALK_PROCESS": f"{rank},{size},{coordinator}"} | only_device(rank)
         with _log(logs, rank).open("w") as log:
             output = log if rank else None
             processes.append(

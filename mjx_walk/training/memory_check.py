@@ -5,9 +5,9 @@ from pathlib import Path
 
 import jax
 
+from mjx_walk.algos import Algorithm
 from mjx_walk.utils.devices import device_memory, num_bytes
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.types import Algorithm
 
 _USABLE = 0.9
 """Share of the device's memory that a replay may take."""

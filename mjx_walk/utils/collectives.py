@@ -1,31 +1,23 @@
-"""Means, sums and maxima over the devices that learn together, inside a program; on one device nothing happens."""
+"""Reductions over the devices that train one run together. Without an axis name they return their argument."""
 
 from typing import Any
 
 import jax
 
-AXIS = "devices"
+DEVICES = "devices"
+"""Name of the mapped axis over devices."""
 
 
-def axis() -> str | None:
-    """The name of the axis over devices, in a program that has one."""
-    try:
-        jax.lax.axis_size(AXIS)
-    except NameError:
-        return None
-    return AXIS
-
-
-def mean(tree: Any) -> Any:
+def mean(tree: Any, axis_name: str | None) -> Any:
     """Means over the devices."""
-    return jax.lax.pmean(tree, AXIS) if axis() else tree
+    return jax.lax.pmean(tree, axis_name) if axis_name else tree
 
 
-def total(tree: Any) -> Any:
+def total(tree: Any, axis_name: str | None) -> Any:
     """Sums over the devices."""
-    return jax.lax.psum(tree, AXIS) if axis() else tree
+    return jax.lax.psum(tree, axis_name) if axis_name else tree
 
 
-def largest(tree: Any) -> Any:
+def largest(tree: Any, axis_name: str | None) -> Any:
     """Maxima over the devices."""
-    return jax.lax.pmax(tree, AXIS) if axis() else tree
+    return jax.lax.pmax(tree, axis_name) if axis_name else tree

@@ -1,0 +1,88 @@
+"""The interface of a learning algorithm, and the state that all algorithms have."""
+
+import abc
+import copy
+import dataclasses
+from typing import Any
+
+import flax
+import jax
+
+from mjx_walk.envs import Task
+from mjx_walk.envs.inline_evaluation import EvaluationConfig, InlineEvaluation, InlineEvaluator
+from mjx_walk.envs.vector_env import VectorEnv, VectorState
+from mjx_walk.utils.types import ITERATION_COUNT, PER_DEVICE, RANDOM_KEY, Metrics, PolicyFn
+
+
+class TrainState(flax.struct.PyTreeNode):
+    """Everything that influences the next iteration, and nothing else; each algorithm adds its own fields."""
+
+    env: VectorState = flax.struct.field(metadata=PER_DEVICE)
+    evaluation: InlineEvaluation = flax.struct.field(metadata=PER_DEVICE)
+    key: jax.Array = flax.struct.field(metadata=RANDOM_KEY)
+    iterations: jax.Array = flax.struct.field(metadata=ITERATION_COUNT)
+    """`[] i32`: iterations so far."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Algorithm(abc.ABC):
+    """A learning algorithm for one task, as pure functions of a `TrainState`.
+
+    `collect` contains no gradients and `learn` no physics. An object is hashed by its identity and is static under
+    `jit`; constants are built when it is constructed.
+    """
+
+    task: Task
+    """The unbatched environment."""
+    num_envs: int
+    """Environments that train, B."""
+    evaluation: EvaluationConfig
+    """Settings of the inline evaluation."""
+    config: Any
+    """Settings of the algorithm, copied."""
+    axis_name: str | None = None
+    """Mapped axis over devices in `learn`, if several devices train one run."""
+    evaluator: InlineEvaluator = dataclasses.field(init=False, repr=False)
+    env: VectorEnv = dataclasses.field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        # Configurations are mutable, and the hash would not change with them.
+        self._set(config=copy.deepcopy(self.config), evaluation=copy.deepcopy(self.evaluation))
+        evaluator = InlineEvaluator(self.task, self.num_envs, self.evaluation, self.policy, self.steps_per_iteration)
+        env = VectorEnv(self.task, self.num_envs, evaluator, self.config.init_at_random_episode_step)
+        self._set(evaluator=evaluator, env=env)
+
+    def _set(self, **constants: Any) -> None:
+        """Set fields, during construction only."""
+        for name, value in constants.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    @abc.abstractmethod
+    def steps_per_iteration(self) -> int:
+        """Environment steps of one `collect`, over all environments."""
+
+    @property
+    def replay_bytes(self) -> int:
+        """Memory of the replay, if there is one."""
+        return 0
+
+    @abc.abstractmethod
+    def init(self, key: jax.Array) -> Any:
+        """The `TrainState` before the first iteration."""
+
+    @abc.abstractmethod
+    def collect(self, state: Any) -> tuple[Any, Any]:
+        """Act and step all environments: `TrainState → (TrainState, batch)`."""
+
+    @abc.abstractmethod
+    def learn(self, state: Any, batch: Any) -> tuple[Any, Metrics]:
+        """Gradient steps on the batch: `(TrainState, batch) → (TrainState, metrics)`."""
+
+    @abc.abstractmethod
+    def policy_params(self, state: Any) -> Any:
+        """The part of the state that the policy needs, small enough to ship."""
+
+    @abc.abstractmethod
+    def policy(self, policy_params: Any, deterministic: bool = True) -> PolicyFn:
+        """The policy as a function of observations and a key."""

@@ -1,0 +1,142 @@
+"""What TD3 and DDPG share: a deterministic policy, critics whose minimum is the target, and Gaussian exploration."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import flax
+import jax
+import jax.numpy as jnp
+import optax
+from brax.training import types as brax_types
+from brax.training.networks import FeedForwardNetwork
+
+from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm, OffPolicyConfig
+from mjx_walk.common import networks
+from mjx_walk.common.optimizers import apply_gradients, make_adam, polyak_update
+from mjx_walk.utils.settings import setting
+
+
+@dataclasses.dataclass
+class DeterministicConfig(OffPolicyConfig):
+    """Settings that TD3 and DDPG share."""
+
+    min_exploration_noise: float = setting(0.1, at_least=0)
+    """Std of the Gaussian noise on the first copy's actions, in the networks' `[-1, 1]`."""
+    max_exploration_noise: float = setting(0.1, at_least=0)
+    """On the last copy's; evenly spaced between, so that some copies explore and some stay near the policy."""
+
+
+class DeterministicState(flax.struct.PyTreeNode):
+    """Networks and optimizers."""
+
+    policy: brax_types.Params
+    critic: brax_types.Params
+    target_policy: brax_types.Params
+    target_critic: brax_types.Params
+    policy_optimizer: optax.OptState
+    critic_optimizer: optax.OptState
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DeterministicAlgorithm(OffPolicyAlgorithm):
+    """Source: Fujimoto et al. 2018, algorithm 1: both targets move when the policy does."""
+
+    num_critics: ClassVar[int]
+
+    config: DeterministicConfig
+    policy_network: FeedForwardNetwork = dataclasses.field(init=False, repr=False)
+    critic_network: FeedForwardNetwork = dataclasses.field(init=False, repr=False)
+    optimizer: optax.GradientTransformation = dataclasses.field(init=False, repr=False)
+    exploration_noise: jax.Array = dataclasses.field(init=False, repr=False)
+    """`[B, 1]`: standard deviation of each environment's noise."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        config = self.config
+        policy, critic = networks.make_deterministic_networks(self.task, config, self.num_critics)
+        noise = jnp.linspace(config.min_exploration_noise, config.max_exploration_noise, self.num_envs)[:, None]
+        self._set(
+            policy_network=policy,
+            critic_network=critic,
+            optimizer=make_adam(config.max_grad_norm),
+            exploration_noise=noise,
+        )
+
+    @property
+    def target_noise(self) -> tuple[float, float]:
+        """Standard deviation and bound of the noise that smooths the target policy."""
+        return 0.0, 0.0
+
+    def init_learner(self, key: jax.Array) -> DeterministicState:
+        policy_key, critic_key = jax.random.split(key)
+        policy, critic = self.policy_network.init(policy_key), self.critic_network.init(critic_key)
+        return DeterministicState(
+            policy=policy,
+            critic=critic,
+            target_policy=policy,
+            target_critic=critic,
+            policy_optimizer=self.optimizer.init(policy),
+            critic_optimizer=self.optimizer.init(critic),
+        )
+
+    def deterministic_action(self, params: Any, obs: jax.Array) -> jax.Array:
+        """The action of the policy, `[…, action_size]`."""
+        return jnp.tanh(self.policy_network.apply(None, params, obs))
+
+    def explore(self, params: Any, obs: jax.Array, key: jax.Array) -> jax.Array:
+        action = self.deterministic_action(params, obs)
+        return jnp.clip(action + self.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
+
+    def act(self, params: Any, obs: jax.Array, key: jax.Array, deterministic: bool) -> jax.Array:
+        return self.deterministic_action(params, obs) if deterministic else self.explore(params, obs, key)
+
+    def critic_target(self, learner: DeterministicState, batch: Batch, key: jax.Array) -> jax.Array:
+        """Targets of the critics, `[N]`, from the smoothed target policy and the minimum of the target critics."""
+        data = batch.transitions
+        std, bound = self.target_noise
+        action = self.deterministic_action(learner.target_policy, data.next_observation)
+        smoothing = std * jax.random.normal(key, action.shape)
+        action = jnp.clip(action + jnp.clip(smoothing, -bound, bound), -1.0, 1.0)
+        values = self.critic_network.apply(None, learner.target_critic, data.next_observation, action)
+        return data.reward * batch.reward_scale + data.discount * values.min(axis=-1)
+
+    def critic_loss(self, critic: Any, target: jax.Array, batch: Batch) -> tuple[jax.Array, jax.Array]:
+        """The squared error, summed over critics, and their mean value."""
+        data = batch.transitions
+        values = self.critic_network.apply(None, critic, data.observation, data.action)
+        return jnp.square(values - target[:, None]).mean(axis=0).sum(), values.mean()
+
+    def policy_loss(self, policy: Any, critic: Any, batch: Batch) -> jax.Array:
+        """Minus the first critic's value of the policy's actions."""
+        obs = batch.transitions.observation
+        action = self.deterministic_action(policy, obs)
+        return -self.critic_network.apply(None, critic, obs, action)[:, 0].mean()
+
+    def critic_update(
+        self, learner: DeterministicState, batch: Batch, key: jax.Array
+    ) -> tuple[DeterministicState, dict[str, jax.Array]]:
+        target = self.critic_target(learner, batch, key)
+        (loss, value), grads = jax.value_and_grad(self.critic_loss, has_aux=True)(learner.critic, target, batch)
+        rate = self.config.critic_learning_rate * batch.rate_factor
+        critic, critic_optimizer = apply_gradients(
+            self.optimizer, learner.critic, grads, learner.critic_optimizer, rate, self.axis_name
+        )
+        metrics = {"critic_loss": loss, "critic_value": value, "critic_grad_norm": optax.global_norm(grads)}
+        return learner.replace(critic=critic, critic_optimizer=critic_optimizer), metrics
+
+    def full_update(
+        self, learner: DeterministicState, batch: Batch, key: jax.Array
+    ) -> tuple[DeterministicState, dict[str, jax.Array]]:
+        learner, metrics = self.critic_update(learner, batch, key)
+        loss, grads = jax.value_and_grad(self.policy_loss)(learner.policy, learner.critic, batch)
+        rate = self.config.policy_learning_rate * batch.rate_factor
+        policy, policy_optimizer = apply_gradients(
+            self.optimizer, learner.policy, grads, learner.policy_optimizer, rate, self.axis_name
+        )
+        learner = learner.replace(
+            policy=policy,
+            policy_optimizer=policy_optimizer,
+            target_policy=polyak_update(learner.target_policy, policy, self.config.tau),
+            target_critic=polyak_update(learner.target_critic, learner.critic, self.config.tau),
+        )
+        return learner, metrics | {"policy_loss": loss}

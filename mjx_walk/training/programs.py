@@ -1,0 +1,149 @@
+"""Compiled programs: one run, several seeds in one program, or several devices that train one run.
+
+The trainer calls their functions and does not know which of them it runs.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_walk.algos import Algorithm, TrainState
+from mjx_walk.utils.types import Metrics
+
+Step = Callable[[TrainState], tuple[TrainState, Metrics]]
+
+
+class Program(NamedTuple):
+    """The functions of one or several runs. A state of several runs has an axis of runs in front."""
+
+    init: Callable[[list[jax.Array]], TrainState]
+    """`keys of the runs → state`."""
+    step: Step
+    """One call: `state → (state, metrics)`, several iterations. It consumes the state."""
+    split: Callable[[TrainState], list[TrainState]]
+    """The state of each run, without an axis in front; on the host if there was one."""
+    merge: Callable[[list[TrainState]], TrainState]
+    """The inverse of `split`."""
+    policies: Callable[[TrainState], list[Any]]
+    """The policy parameters of each run."""
+    split_metrics: Callable[[Metrics], list[Metrics]]
+    """The metrics of each run, on the host, `[iterations]` each."""
+    is_finite: Callable[[TrainState], np.ndarray]
+    """`[runs] bool`: whether each run's policy is finite."""
+    max_over_processes: Callable[[int], int]
+    """The largest of the numbers that the processes pass."""
+
+
+def make_init(init: Callable[[jax.Array], TrainState]) -> Callable[[jax.Array], TrainState]:
+    """Compile `key → TrainState` without weak types, with which the first call would compile twice."""
+
+    def strong(key):
+        return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), init(key))
+
+    return jax.jit(strong)
+
+
+def make_step(collect: Callable, learn: Callable, iterations_per_call: int, fused: bool) -> Step:
+    """Compile several iterations into one call.
+
+    Args:
+        collect: `TrainState → (TrainState, batch)`.
+        learn: `(TrainState, batch) → (TrainState, metrics)`.
+        iterations_per_call: iterations of a call.
+        fused: compile both into one program. Engines that call back to the host need separate programs, because JAX
+            does not keep programs with callbacks in its compile cache.
+    """
+
+    def iterate(state, _):
+        return learn(*collect(state))
+
+    if fused:
+        return jax.jit(lambda state: jax.lax.scan(iterate, state, length=iterations_per_call), donate_argnums=0)
+    compiled_collect, compiled_learn = jax.jit(collect, donate_argnums=0), jax.jit(learn, donate_argnums=0)
+
+    def step(state: TrainState) -> tuple[TrainState, Metrics]:
+        rows = []
+        for _ in range(iterations_per_call):
+            state, metrics = compiled_learn(*compiled_collect(state))
+            rows.append(metrics)
+        return state, jax.tree.map(lambda *xs: jnp.stack(xs), *rows)
+
+    return step
+
+
+def make_single_program(algorithm: Algorithm, iterations_per_call: int, fused: bool) -> Program:
+    """One run on one device."""
+    is_finite = jax.jit(functools.partial(has_finite_policy, algorithm))
+    init = make_init(algorithm.init)
+    return Program(
+        init=lambda keys: init(keys[0]),
+        step=make_step(algorithm.collect, algorithm.learn, iterations_per_call, fused),
+        split=lambda state: [state],
+        merge=lambda states: states[0],
+        policies=lambda state: [algorithm.policy_params(state)],
+        split_metrics=lambda metrics: [jax.device_get(metrics)],
+        is_finite=lambda state: np.atleast_1d(is_finite(state)),
+        max_over_processes=lambda number: number,
+    )
+
+
+def make_seeds_program(algorithm: Algorithm, num_seeds: int, iterations_per_call: int, fused: bool) -> Program:
+    """Several runs that differ in their seed, in one program on one device."""
+    init = make_init(jax.vmap(algorithm.init))
+    return make_axis_program(
+        algorithm,
+        num_seeds,
+        init=lambda keys: init(jnp.stack(keys)),
+        step=make_step(jax.vmap(algorithm.collect), jax.vmap(algorithm.learn), iterations_per_call, fused),
+        split_metrics=functools.partial(_split_metrics, num_seeds),
+    )
+
+
+def make_axis_program(
+    algorithm: Algorithm,
+    num_runs: int,
+    init: Callable[[list[jax.Array]], TrainState],
+    step: Step,
+    split_metrics: Callable[[Metrics], list[Metrics]],
+    max_over_processes: Callable[[int], int] = lambda number: number,
+) -> Program:
+    """A program whose state has an axis of runs in front."""
+    is_finite = jax.jit(jax.vmap(functools.partial(has_finite_policy, algorithm)))
+
+    def policies(state: TrainState) -> list[Any]:
+        params = algorithm.policy_params(state)
+        return [jax.tree.map(lambda x, i=i: x[i], params) for i in range(num_runs)]
+
+    def split(state: TrainState) -> list[TrainState]:
+        state = jax.device_get(state)
+        return [jax.tree.map(lambda x, i=i: x[i], state) for i in range(num_runs)]
+
+    def merge(states: list[TrainState]) -> TrainState:
+        # On the host, which has room for all of them twice.
+        return jax.tree.map(lambda *xs: jnp.asarray(np.stack(xs)), *map(jax.device_get, states))
+
+    return Program(
+        init=init,
+        step=step,
+        split=split,
+        merge=merge,
+        policies=policies,
+        split_metrics=split_metrics,
+        is_finite=lambda state: np.asarray(is_finite(state)),
+        max_over_processes=max_over_processes,
+    )
+
+
+def has_finite_policy(algorithm: Algorithm, state: TrainState) -> jax.Array:
+    """Whether every parameter of the policy is finite, `[] bool`."""
+    leaves = jax.tree.leaves(algorithm.policy_params(state))
+    return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in leaves]))
+
+
+def _split_metrics(num_runs: int, metrics: Metrics) -> list[Metrics]:
+    metrics = jax.device_get(metrics)
+    return [jax.tree.map(lambda x, i=i: x[:, i], metrics) for i in range(num_runs)]
