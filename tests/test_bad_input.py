@@ -9,7 +9,7 @@ import sys
 
 import pytest
 import yaml
-from commands import TINY, TINY_CHUNK, command, command_here
+from helpers import TINY, TINY_CHUNK, command, command_here
 
 from mjx_walk import api
 from mjx_walk import bench as bench_command

@@ -5,7 +5,7 @@ import json
 import jax
 import jax.numpy as jnp
 import pytest
-from commands import TINY, TINY_OFF_POLICY, command, command_here
+from helpers import TINY, TINY_OFF_POLICY, command, command_here
 
 from mjx_walk.bench import device_counts
 from mjx_walk.experiments import timing

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from commands import command
+from helpers import command
 
 from mjx_walk import parity
 from mjx_walk.envs import TASKS

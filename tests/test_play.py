@@ -7,26 +7,12 @@ import imageio.v3 as iio
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from commands import ENVIRONMENT, command, command_here
+from helpers import ENVIRONMENT, command, command_here, renders
 
 import mjx_walk
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing import rendering
 from mjx_walk.viewing.episode import record_episode
-
-
-def can_render():
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("MUJOCO_GL", "")
-        patched.delenv("MUJOCO_GL")
-        try:
-            rendering.choose_opengl()
-        except UserError:
-            return False
-        return True
-
-
-renders = pytest.mark.skipif(not can_render(), reason="nothing to render with: install libegl1 and libopengl0")
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +71,7 @@ def test_gait_sheet(tmp_path):
     assert not list(tmp_path.glob("*.mp4"))
 
 
-def test_mistakes_cost_one_line(tmp_path, monkeypatch, capsys):
+def test_play_prints_a_one_line_error(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     (tmp_path / "file").write_text("")

@@ -6,23 +6,17 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
-from commands import TINY, command
+from helpers import CLONE, README, TINY, blocks, command
 
 import mjx_walk
 from mjx_walk import zoo
 from mjx_walk.envs import make_env
 from mjx_walk.runs.config import load_config
 
-CLONE = Path(__file__).parent.parent
-README = (CLONE / "README.md").read_text()
 RESULTS = (CLONE / "docs" / "results.md").read_text()
 PAGES = {path: path.read_text() for path in (CLONE / "README.md", *sorted((CLONE / "docs").glob("*.md")))}
 RUN_ELSEWHERE = ("bench", "parity")
 """Commands that tests of their own run, at sizes of their own."""
-
-
-def blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
 
 
 def file(name):

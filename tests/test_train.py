@@ -5,22 +5,15 @@ import math
 from pathlib import Path
 
 import gymnasium
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import TINY, TINY_CHUNK, command_here
+from helpers import TINY, TINY_CHUNK, command_here
 from tensorboardX.proto.event_pb2 import Event
 
 import mjx_walk
 from mjx_walk import train as train_command
-from mjx_walk.algos import make_algorithm
-from mjx_walk.api import make_task
 from mjx_walk.envs import make_env
-from mjx_walk.runs.config import load_config
 from mjx_walk.training import trainer
-from mjx_walk.training.trainer import make_chunk, make_init
-from mjx_walk.utils.errors import UserError
 
 
 @pytest.fixture(scope="module")
@@ -117,37 +110,6 @@ def test_eval_command(finished, capsys):
     assert "Walker2d-v5 on c" in capsys.readouterr().out
 
 
-def test_the_same_seed_gives_the_same_run_and_another_does_not(tmp_path):
-    losses = []
-    for i, seed in enumerate((1, 1, 2)):
-        run = [*TINY, f"run_dir={tmp_path}/{i}", f"total_steps={3 * TINY_CHUNK}", f"seed={seed}"]
-        losses.append([row["train/loss"] for row in mjx_walk.run(run).metrics[1:]])
-    assert losses[0] == losses[1] != losses[2]
-
-
-def test_nothing_is_compiled_twice():
-    config = load_config([*TINY, "physics=c"])
-    task = make_task(config)
-    traces = 0
-    step = task.step
-
-    def counted(state, action):
-        nonlocal traces
-        traces += 1
-        return step(state, action)
-
-    task.step = counted
-    algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
-    chunk = make_chunk(algorithm, 2, fused=True)
-    state = make_init(algorithm)(jax.random.PRNGKey(0))
-    state, _ = chunk(state)
-    after_first = traces
-    for _ in range(3):
-        state, metrics = chunk(state)
-    assert traces == after_first and metrics["loss"].shape == (2,)
-    assert chunk._cache_size() == 1
-
-
 def test_a_sweep_puts_each_job_in_its_own_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arguments = [*TINY, f"total_steps={TINY_CHUNK}"]
@@ -184,67 +146,6 @@ def test_an_asset_of_gymnasium_s_is_a_model():
     env = gymnasium.make(task.gymnasium_id, **task.gymnasium_kwargs())
     assert env.unwrapped.fullpath.endswith("assets/walker2d.xml")
     np.testing.assert_array_equal(env.unwrapped.model.geom_size, task.model.geom_size)
-
-
-def test_a_chunk_is_told_before_the_next_begins(tmp_path, monkeypatch):
-    """So that a row's seconds, and the speed beside them, are those of its own chunk."""
-    events = []
-
-    def counted(*args, **kwargs):
-        chunk = make_chunk(*args, **kwargs)
-
-        def begin(state):
-            events.append("begins")
-            return chunk(state)
-
-        return begin
-
-    monkeypatch.setattr(trainer, "make_chunk", counted)
-    overrides = [*TINY, f"run_dir={tmp_path / 'run'}", f"total_steps={3 * TINY_CHUNK}"]
-    mjx_walk.run(overrides, on_metrics=lambda row: events.append("is told"))
-    assert events == 3 * ["begins", "is told"]
-
-
-def test_a_reward_that_is_not_finite_is_told_once(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text(
-        "import jax.numpy as jnp\ndef root(step):\n    return {'reward_root': jnp.sqrt(-1 - step.after.qpos[0] ** 2)}\n"
-    )
-    train_command.main([*TINY, f"total_steps={2 * TINY_CHUNK}", "env.reward_function=mine.py:root"])
-    said = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
-    assert len(said) == 1 and "64 of 64 steps ended their episodes without a reward" in said[0]
-
-
-def test_training_that_diverges_stops_and_keeps_what_was_saved_before(tmp_path):
-    run, steps = tmp_path / "run", f"total_steps={50 * TINY_CHUNK}"
-    arguments = [*TINY, f"run_dir={run}", "checkpoint.every_calls=1", steps]
-    with pytest.raises(UserError, match=r"training has diverged: .* the policy of seed 0 is not finite"):
-        train_command.main([*arguments, "algo.learning_rate=1e30"])
-    assert 1 <= len((run / "metrics.jsonl").read_text().splitlines()) <= 3
-    # Nothing is learned from the first batch: what was saved after it is sound. What came of the second is not.
-    assert sorted(path.name for path in (run / "checkpoints").iterdir()) == [f"{TINY_CHUNK:013d}", "best"]
-    policy_params = mjx_walk.load_run(run).policy_params
-    assert all(np.isfinite(np.asarray(leaf, np.float64)).all() for leaf in jax.tree.leaves(policy_params))
-
-
-def test_of_seeds_side_by_side_those_that_are_sound_are_saved(tmp_path, monkeypatch):
-    """The second one's policy is broken from the start."""
-
-    def broken(algorithm):
-        init = make_init(algorithm)
-
-        def break_second(key):
-            state = init(key)
-            policy = jax.tree.map(lambda x: x.at[1].set(jnp.nan), state.params.policy)
-            return state.replace(params=state.params.replace(policy=policy))
-
-        return break_second
-
-    monkeypatch.setattr(trainer, "make_init", broken)
-    with pytest.raises(UserError, match="the policy of seed 5 is not finite"):
-        train_command.main([*TINY, f"run_dir={tmp_path}", "seeds=[3,5]", f"total_steps={50 * TINY_CHUNK}"])
-    assert len(list((tmp_path / "seed_3" / "checkpoints").glob("0*"))) == 1
-    assert not list((tmp_path / "seed_5" / "checkpoints").iterdir())
 
 
 def test_configuration_can_be_printed(capsys):

@@ -2,6 +2,8 @@
 
 import jax
 import jax.numpy as jnp
+from brax.envs.base import Env
+from brax.envs.base import State as BraxState
 
 from mjx_walk.envs import State, TaskOptions
 from mjx_walk.envs.physics import PhysicsState
@@ -139,3 +141,15 @@ class MountainCar(ToyTask):
 
     def observe(self, qpos, qvel):
         return jnp.concatenate([qpos, qvel])
+
+
+class BraxSizes(Env):
+    """Tells Brax's trainer the sizes; its transitions come from our own environment."""
+
+    observation_size, action_size, backend = 17, 6, "mjx"
+
+    def reset(self, rng):
+        return BraxState(None, jnp.zeros(17), jnp.zeros(()), jnp.zeros(()))
+
+    def step(self, state, action):
+        return state

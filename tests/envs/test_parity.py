@@ -67,7 +67,7 @@ def test_a_wrong_engine_is_noticed():
 
 
 @pytest.mark.parametrize("physics", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
-def test_reset_observation(physics):
+def test_reset_observation_equals_the_c_engine(physics):
     keys = jax.random.split(jax.random.PRNGKey(0), 4)
     expected = jax.vmap(make_env("humanoid", physics="c").reset)(keys)
     found = jax.jit(jax.vmap(make_env("humanoid", physics=physics).reset))(keys)

@@ -5,9 +5,8 @@ import struct
 import imageio.v3 as iio
 import imageio_ffmpeg
 import pytest
-from commands import TINY, TINY_CHUNK, command
+from helpers import TINY, TINY_CHUNK, command, renders
 from tensorboardX.proto.event_pb2 import Event
-from test_play import renders
 
 from mjx_walk import api
 from mjx_walk.viewing import rendering

@@ -87,7 +87,7 @@ def test_td3_full_update_moves_policy_and_targets(loud_noise):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), target, expected)
 
 
-def test_gradients_are_clipped(loud_noise):
+def test_td3_gradients_are_clipped(loud_noise):
     """Adam's first moments are a tenth of them."""
     learner, state = make(TD3Config(**LINEAR, max_grad_norm=1e-3), 2, 0.2, 0.5)
     new, _ = learner.full_update(state, batch(), jax.random.PRNGKey(0))

@@ -11,31 +11,12 @@ import sys
 import time
 
 import numpy as np
-import orbax.checkpoint as ocp
 import pytest
-from commands import TINY, TINY_CHUNK, TINY_OFF_POLICY, command, command_here
-from test_checkpoint import flip_a_byte
+from helpers import TINY, TINY_CHUNK, TINY_OFF_POLICY, command_here, flip_a_byte, leaves, train, train_here
 
 from mjx_walk.api import resolve
 from mjx_walk.runs import checkpoint
 from mjx_walk.utils.subprocesses import start_module
-
-
-def leaves(run_dir, chunk):
-    with ocp.PyTreeCheckpointer() as checkpointer:
-        path = checkpoint.step_path(run_dir / "checkpoints", chunk * TINY_CHUNK)
-        parts = [checkpointer.restore(part) for part in (path / "arrays", path / "replay") if part.exists()]
-    return {name: leaf for part in parts for name, leaf in part.items()}
-
-
-def train_here(run_dir, *arguments, tiny=TINY):
-    assert command_here("train", *tiny, f"run_dir={run_dir}", *arguments) == 0
-
-
-def train(run_dir, *arguments, tiny=TINY):
-    done = command("train", *tiny, f"run_dir={run_dir}", *arguments)
-    assert done.returncode == 0, done.stderr
-    return done
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import flip_a_byte
 
 from mjx_walk.runs import checkpoint
 from mjx_walk.utils.errors import UserError
@@ -13,14 +14,6 @@ TREE = {
     "a": jnp.arange(6, dtype=jnp.float32).reshape(2, 3),
     "b": {"key": jnp.array([1, 2], jnp.uint32), "flag": jnp.array([True, False]), "n": jnp.array(7, jnp.int32)},
 }
-
-
-def flip_a_byte(folder):
-    """Damage the largest data file."""
-    path = max((p for p in (folder / "arrays").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0xFF
-    path.write_bytes(data)
 
 
 def test_round_trip_keeps_every_bit_and_type(tmp_path):

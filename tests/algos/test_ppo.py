@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs.base import Env, State
 from brax.training import acting
 from brax.training.agents.ppo import networks as brax_networks
 from brax.training.agents.ppo import train as brax_ppo
 from brax.training.agents.ppo.losses import PPONetworkParams
-from toy_tasks import ConstantReward, EndlessReward
+from toy_tasks import BraxSizes, ConstantReward, EndlessReward
 
 from mjx_walk.algos.on_policy import OnPolicyConfig, _make_optimizer
 from mjx_walk.algos.ppo import PPOConfig, make_ppo
@@ -31,19 +30,7 @@ SMALL = PPOConfig(
 )
 
 
-class Sizes(Env):
-    """Tells Brax's trainer the sizes; its transitions come from our own environment."""
-
-    observation_size, action_size, backend = 17, 6, "mjx"
-
-    def reset(self, rng):
-        return State(None, jnp.zeros(17), jnp.zeros(()), jnp.zeros(()))
-
-    def step(self, state, action):
-        return state
-
-
-def test_update_equals_brax(monkeypatch):
+def test_ppo_update_equals_brax(monkeypatch):
     """Brax's own trainer, given our initial networks and our transitions, ends at our parameters.
 
     The shuffle is fixed and the entropy bonus off, since the two draw their keys in another order. No episode
@@ -68,7 +55,7 @@ def test_update_equals_brax(monkeypatch):
     monkeypatch.setattr(acting, "generate_unroll", lambda env, state, *args, **kwargs: (state, data))
     restore_device_put_replicated()
     _, theirs, _ = brax_ppo.train(
-        environment=Sizes(),
+        environment=BraxSizes(),
         num_timesteps=32 * 8,
         num_evals=1,
         run_evals=False,

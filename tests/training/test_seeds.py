@@ -4,8 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from commands import TINY, TINY_CHUNK, TINY_OFF_POLICY
-from test_resume import leaves, train, train_here
+from helpers import TINY, TINY_CHUNK, TINY_OFF_POLICY, leaves, train, train_here
 
 from mjx_walk import train as train_command
 from mjx_walk.runs.config import load_config, save_config

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import ENVIRONMENT, TINY, TINY_CHUNK, TINY_OFF_POLICY, command
+from helpers import ENVIRONMENT, TINY, TINY_CHUNK, TINY_OFF_POLICY, command
 from toy_tasks import ObservedReward
 
 from mjx_walk.algos.off_policy import OffPolicyConfig

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from commands import command, command_here
+from helpers import command, command_here
 
 import mjx_walk
 from mjx_walk import zoo

@@ -8,8 +8,7 @@ import pytest
 from brax.training import acting
 from brax.training.agents.sac import networks as brax_networks
 from brax.training.agents.sac import train as brax_sac
-from test_ppo import Sizes
-from toy_tasks import ToyTask
+from toy_tasks import BraxSizes, ToyTask
 
 from mjx_walk.algos.off_policy import Batch
 from mjx_walk.algos.sac import SACConfig, make_sac, make_sac_learner
@@ -22,7 +21,7 @@ from mjx_walk.utils.types import Transition
 NUM_ENVS, BATCH, UPDATES = 16, 32, 5
 
 
-def test_update_equals_brax(monkeypatch):
+def test_sac_update_equals_brax(monkeypatch):
     """Brax's own trainer, given our networks, our steps and our samples, ends at our parameters after five updates.
 
     Noise is a fixed function of the shape, since the two draw their keys in another order.
@@ -99,7 +98,7 @@ def test_update_equals_brax(monkeypatch):
     monkeypatch.setattr(acting.Evaluator, "run_evaluation", lambda *args, **kwargs: {})
     restore_device_put_replicated()
     brax_sac.train(
-        environment=Sizes(),
+        environment=BraxSizes(),
         num_timesteps=NUM_ENVS,
         episode_length=1,
         num_envs=NUM_ENVS,
@@ -144,7 +143,7 @@ def test_the_target_entropy_moves_over_the_schedule():
     assert moved[0] < 0 and moved[1] < 0 < moved[2]
 
 
-def test_gradients_are_clipped():
+def test_sac_gradients_are_clipped():
     """Adam's first moments are a tenth of them."""
     for limit, is_clipped in ((1e-3, True), (None, False)):
         learner = make_sac_learner(ToyTask(), SACConfig(max_grad_norm=limit))

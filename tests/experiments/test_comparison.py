@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from commands import ENVIRONMENT, command, command_here
+from helpers import ENVIRONMENT, command, command_here
 
 from mjx_walk import compare as compare_command
 from mjx_walk.experiments import planned_runs, report

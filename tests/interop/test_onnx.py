@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import onnxruntime
 import pytest
-from commands import command_here
-from test_readme import blocks
+from helpers import blocks, command_here
 
 import mjx_walk
 from mjx_walk import zoo
@@ -96,7 +95,7 @@ def test_example_of_readme(tmp_path, capsys):
     assert int(total.replace(",", "")) > 11_500
 
 
-def test_mistakes_cost_one_line(tmp_path, capsys):
+def test_export_prints_a_one_line_error(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     for arguments, message in (
         ((), "say which run: run=RUN_DIR, or zoo:NAME"),

@@ -5,7 +5,7 @@ import json
 import subprocess
 
 import pytest
-from commands import TINY, TINY_CHUNK, command
+from helpers import TINY, TINY_CHUNK, command
 from wandb.proto.wandb_internal_pb2 import Record
 
 import mjx_walk.api

@@ -1,12 +1,21 @@
 """Run the commands as a user does, small."""
 
 import os
+import re
 import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import orbax.checkpoint as ocp
 import pytest
+
+from mjx_walk.runs import checkpoint
+from mjx_walk.utils.errors import UserError
+from mjx_walk.viewing import rendering
+
+CLONE = Path(__file__).parent.parent
+README = (CLONE / "README.md").read_text()
 
 TINY = (
     "env=walker2d",
@@ -39,7 +48,7 @@ TINY_CHUNK = 8 * 8
 """Environment steps of a chunk of either."""
 
 
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(CLONE)}
 
 
 def command(module: str, *arguments: str, **kwargs) -> subprocess.CompletedProcess:
@@ -63,3 +72,46 @@ def command_here(module: str, *arguments: str) -> int:
         with pytest.raises(SystemExit) as ended:
             runpy.run_module(f"mjx_walk.{module}", run_name="__main__", alter_sys=True)
     return ended.value.code
+
+
+def leaves(run_dir, chunk):
+    with ocp.PyTreeCheckpointer() as checkpointer:
+        path = checkpoint.step_path(run_dir / "checkpoints", chunk * TINY_CHUNK)
+        parts = [checkpointer.restore(part) for part in (path / "arrays", path / "replay") if part.exists()]
+    return {name: leaf for part in parts for name, leaf in part.items()}
+
+
+def train_here(run_dir, *arguments, tiny=TINY):
+    assert command_here("train", *tiny, f"run_dir={run_dir}", *arguments) == 0
+
+
+def train(run_dir, *arguments, tiny=TINY):
+    done = command("train", *tiny, f"run_dir={run_dir}", *arguments)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def flip_a_byte(folder):
+    """Damage the largest data file."""
+    path = max((p for p in (folder / "arrays").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+
+
+def can_render():
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("MUJOCO_GL", "")
+        patched.delenv("MUJOCO_GL")
+        try:
+            rendering.choose_opengl()
+        except UserError:
+            return False
+        return True
+
+
+renders = pytest.mark.skipif(not can_render(), reason="nothing to render with: install libegl1 and libopengl0")
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
