@@ -115,3 +115,8 @@ renders = pytest.mark.skipif(not can_render(), reason="nothing to render with: i
 
 def blocks(language):
     return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+def values(metrics):
+    """The numbers of metrics, by their names."""
+    return {name: metric.value for name, metric in metrics.items()}

@@ -39,7 +39,7 @@ class SavedPolicy:
         self.algorithm = make_algorithm(self.task, self.config.num_envs, self.config.evaluation, algo)
         state = jax.eval_shape(self.algorithm.init, jax.random.PRNGKey(0))
         like = jax.eval_shape(self.algorithm.policy_params, state)
-        self.policy_params, self.policy_facts = _load_best_policy(folder, like)
+        self.policy_params, self.policy_facts = load_best_policy(folder, like)
 
     @functools.cached_property
     def act(self) -> Callable:
@@ -66,7 +66,12 @@ def deterministic_act(algorithm: Algorithm, policy_params: Any) -> Callable[[Any
     return jax.jit(lambda obs: policy(obs, jax.random.PRNGKey(0)))
 
 
-def _load_best_policy(folder: RunFolder, like: Any) -> tuple[Any, dict[str, Any]]:
+def load_best_policy(folder: RunFolder, like: Any) -> tuple[Any, dict[str, Any]]:
+    """The best policy of a run and its facts; see `checkpoint.restore`.
+
+    Raises:
+        UserError: the run has saved none yet, it is damaged, or it belongs to another environment.
+    """
     if not folder.best_policy.exists():
         raise UserError(f"{folder.path} holds no policy yet; train it first")
     try:

@@ -137,8 +137,7 @@ class Recorder:
         candidates = self._policies[-1:] if self._task.has_own_reward else self._policies
         for params, facts in candidates:
             if not scored or facts["eval_return"] > scored[0][0].mean:
-                act = deterministic_act(self._algorithm, params)
-                scored.append((score_in_gymnasium(self._task, act, num_episodes), params, facts))
+                scored.append((self._score_in_gymnasium(params, num_episodes), params, facts))
         scores, params, facts = max(scored, key=lambda candidate: candidate[0].mean)
         scores.save(self._folder.gymnasium_scores, env_steps=facts["env_steps"], wall_seconds=wall_seconds)
         self._saver.save((self._folder.best_policy, params, facts))
@@ -149,6 +148,9 @@ class Recorder:
         self._saver.wait()
         if self._filmer:
             self._filmer.wait()
+
+    def _score_in_gymnasium(self, policy_params: Any, num_episodes: int) -> Scores:
+        return score_in_gymnasium(self._task, deterministic_act(self._algorithm, policy_params), num_episodes)
 
     def _best_policy(self, state: TrainState) -> tuple[Any, dict[str, Any]] | None:
         """The policy with the highest inline evaluation, and its facts; None before the first has ended."""

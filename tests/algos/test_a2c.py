@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import values
 from toy_tasks import DelayedReward, RewardedAction
 
-from mjx_walk.algos.a2c import A2CConfig, make_a2c
+from mjx_walk.algos.a2c import A2C, A2CConfig
 from mjx_walk.algos.policy_gradient import out_of_bounds, policy_gradient_loss, sampled_kl
 from mjx_walk.common import networks
 from mjx_walk.common.exploration import OrnsteinUhlenbeck
@@ -20,7 +21,7 @@ GAUSSIAN = {"distribution": "normal", "policy_hidden_layer_sizes": (8,), "value_
 def collected(task, **changes):
     """Config, algorithm, state and batch after one `collect`."""
     config = A2CConfig(unroll_length=STEPS, normalizer_warmup_steps_per_env=0, reward_scale=2.0, **GAUSSIAN, **changes)
-    algorithm = make_a2c(task, NUM_ENVS, EvaluationConfig(1), config)
+    algorithm = A2C(task, NUM_ENVS, EvaluationConfig(1), config)
     before = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
     return config, algorithm, *jax.jit(algorithm.collect)(before)
 
@@ -32,11 +33,12 @@ def test_losses(gae_lambda):
         DelayedReward(), gae_lambda=gae_lambda, discount=0.5, normalize_advantages=False
     )
     after, metrics = jax.jit(algorithm.learn)(state, batch)
+    metrics = values(metrics)
     steps, nets = batch.transitions, networks.make_ppo_networks(DelayedReward(), config)
     obs = jnp.concatenate([steps.observation, steps.next_observation], axis=1)
-    values = np.asarray(nets.value_network.apply(state.normalizer, state.params.value, obs))
+    predicted = np.asarray(nets.value_network.apply(state.normalizer, state.params.value, obs))
     assert {0.0, 1.0} == set(np.asarray(steps.discount).ravel())
-    error = 2.0 * steps.reward + 0.5 * steps.discount * values[:, 1:] - values[:, :-1]
+    error = 2.0 * steps.reward + 0.5 * steps.discount * predicted[:, 1:] - predicted[:, :-1]
     advantage, following = np.zeros_like(error), np.zeros(NUM_ENVS)
     for t in reversed(range(STEPS)):
         following = error[:, t] + 0.5 * gae_lambda * steps.discount[:, t] * following
@@ -52,6 +54,7 @@ def test_losses(gae_lambda):
 def test_the_loss_is_the_sum_of_its_parts_and_rewards_entropy():
     config, algorithm, state, batch = collected(RewardedAction(), entropy_coef=0.3)
     _, metrics = jax.jit(algorithm.learn)(state, batch)
+    metrics = values(metrics)
     losses = metrics["policy_loss"] + config.value_loss_coef * metrics["value_loss"] + metrics["mean_out_of_bounds"]
     assert abs(float(metrics["entropy"])) > 0.1
     assert float(metrics["loss"]) == pytest.approx(float(losses - 0.3 * metrics["entropy"]), rel=1e-4)
@@ -60,8 +63,8 @@ def test_the_loss_is_the_sum_of_its_parts_and_rewards_entropy():
 def test_correlated_noise_reaches_the_environment():
     """The policy is held at 0, nearly without noise of its own, so that the last reward tells the noise."""
     _, _, state, batch = collected(RewardedAction(), init_noise_std=1e-6, ou_noise_std=0.2)
-    assert state.noise.shape == (NUM_ENVS, 1) and np.asarray(state.noise).std() > 0.1
-    acted = jnp.clip(state.noise[:, 0], -1.0, 1.0)
+    assert state.exploration.shape == (NUM_ENVS, 1) and np.asarray(state.exploration).std() > 0.1
+    acted = jnp.clip(state.exploration[:, 0], -1.0, 1.0)
     np.testing.assert_allclose(batch.transitions.reward[:, -1], -jnp.square(acted - 0.5), atol=1e-2)
 
 
@@ -103,6 +106,7 @@ def test_adaptive_rate_follows_how_far_the_policy_moves():
     settings = {"learning_rate_schedule": "adaptive_kl", "num_minibatches": 8, "learning_rate": 1e-2}
     _, algorithm, state, batch = collected(RewardedAction(), target_kl=1e-5, **settings)
     after, metrics = jax.jit(algorithm.learn)(state, batch)
+    metrics = values(metrics)
     assert float(after.learning_rate) == pytest.approx(1e-2 / 1.5, rel=1e-5) and metrics["kl"] > 2e-5
     _, algorithm, state, batch = collected(RewardedAction(), target_kl=10.0, **settings | {"learning_rate": 1e-4})
     after, _ = jax.jit(algorithm.learn)(state, batch)

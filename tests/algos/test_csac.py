@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import toy_tasks
 
-from mjx_walk.algos.csac import CSACConfig, make_csac, make_csac_learner, make_csac_networks, project
+from mjx_walk.algos.csac import CSAC, CSACConfig, project
 from mjx_walk.algos.off_policy import Batch
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.errors import UserError
@@ -50,8 +50,8 @@ def test_critic_loss_is_the_cross_entropy_to_the_lower_critics_future():
     """One update's loss, computed once more from the networks alone."""
 
     task = toy_tasks.ObservedReward(10)
-    learner = make_csac_learner(task, CONFIG)
-    state = learner.init(jax.random.PRNGKey(0))
+    algorithm = CSAC(task, 4, EvaluationConfig(1), CONFIG)
+    state = algorithm.init_learner(jax.random.PRNGKey(0))
     state = state.replace(target_critic=jax.tree.map(lambda x: 3.0 * x + 0.1, state.critic))
     keys = jax.random.split(jax.random.PRNGKey(1), 5)
     obs, next_obs = jax.random.normal(keys[0], (2, 64, task.observation_size))
@@ -59,9 +59,9 @@ def test_critic_loss_is_the_cross_entropy_to_the_lower_critics_future():
     reward = jax.random.normal(keys[2], (64,))
     discount = 0.9 * jax.random.bernoulli(keys[3], 0.7, (64,)).astype(jnp.float32)
     data = Transition(obs, action, reward, discount, next_obs)
-    _, metrics = learner.critic_update(state, Batch(data, jnp.float32(0.5), 1.0, 1.0), keys[4])
+    _, metrics = algorithm.critic_update(state, Batch(data, jnp.float32(0.5), 1.0, 1.0), keys[4])
 
-    nets, log_distributions, atoms = make_csac_networks(task, CONFIG)
+    nets, log_distributions, atoms = algorithm.nets, algorithm.log_probs, algorithm.atoms
     distribution = nets.parametric_action_distribution
     logits = nets.policy_network.apply(None, state.policy, next_obs)
     raw = distribution.sample_no_postprocessing(logits, keys[4])
@@ -80,4 +80,4 @@ def test_critic_loss_is_the_cross_entropy_to_the_lower_critics_future():
 
 def test_returns_need_a_bound():
     with pytest.raises(UserError, match="normalized_return_max=null: csac needs"):
-        make_csac(toy_tasks.ObservedReward(10), 4, EvaluationConfig(1), CSACConfig(normalized_return_max=None))
+        CSAC(toy_tasks.ObservedReward(10), 4, EvaluationConfig(1), CSACConfig(normalized_return_max=None))

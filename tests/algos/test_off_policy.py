@@ -1,12 +1,16 @@
 """What the off-policy loop hands its learner, told by one that does nothing else."""
 
+import dataclasses
+
+import flax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import values
 from toy_tasks import EndlessReward, ToyTask
 
-from mjx_walk.algos.off_policy import Learner, OffPolicyConfig, make_off_policy
+from mjx_walk.algos.off_policy import OffPolicyAlgorithm, OffPolicyConfig
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 
 NUM_ENVS = 4
@@ -22,18 +26,33 @@ class FarAway(ToyTask):
         return -qpos, qvel, 1.0, False
 
 
-def told(task, num_updates, **changes):
-    """State and metrics, those of all updates, of a learner whose policy is the observation, bounded by its sight."""
+class Learner(flax.struct.PyTreeNode):
+    policy: jax.Array
 
-    def tell(state, batch, key):
-        largest = jnp.abs(batch.transitions.observation).max()
-        rate = jnp.float32(batch.rate_factor)
-        return state, {"rate": rate, "largest_observation": largest, "scale": batch.reward_scale}
 
-    def act(params, obs, key, deterministic=True):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Reporter(OffPolicyAlgorithm):
+    """Learns nothing, and reports what it is handed; its policy is a hundredth of the observation."""
+
+    def init_learner(self, key):
+        return Learner(jnp.zeros(1))
+
+    def act(self, params, obs, key, deterministic):
         return 0.01 * obs
 
-    learner = Learner(lambda key: jnp.zeros(1), lambda state: state, act, act, tell, tell)
+    def explore(self, params, obs, key):
+        return 0.01 * obs
+
+    def critic_update(self, learner, batch, key):
+        largest = jnp.abs(batch.transitions.observation).max()
+        rate = jnp.float32(batch.rate_factor)
+        return learner, {"rate": rate, "largest_observation": largest, "scale": batch.reward_scale}
+
+    full_update = critic_update
+
+
+def told(task, num_updates, **changes):
+    """Algorithm, state and the metrics of all iterations of `Reporter`."""
     settings = {
         "unroll_length": 2,
         "grad_updates_per_step": 1,
@@ -42,12 +61,12 @@ def told(task, num_updates, **changes):
         "learning_starts": 0,
     }
     config = OffPolicyConfig(**settings | changes)
-    algorithm = make_off_policy(task, NUM_ENVS, EvaluationConfig(1), config, learner)
+    algorithm = Reporter(task, NUM_ENVS, EvaluationConfig(1), config)
     state, rows = algorithm.init(jax.random.PRNGKey(0)), []
     update = jax.jit(lambda state: algorithm.learn(*algorithm.collect(state)))
     for _ in range(num_updates):
         state, metrics = update(state)
-        rows.append(metrics)
+        rows.append(values(metrics))
     return algorithm, state, {name: np.stack([row[name] for row in rows]) for name in metrics}
 
 

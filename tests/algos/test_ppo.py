@@ -10,10 +10,11 @@ from brax.training import acting
 from brax.training.agents.ppo import networks as brax_networks
 from brax.training.agents.ppo import train as brax_ppo
 from brax.training.agents.ppo.losses import PPONetworkParams
+from helpers import values
 from toy_tasks import BraxSizes, ConstantReward, EndlessReward
 
 from mjx_walk.algos.on_policy import OnPolicyConfig, _make_optimizer
-from mjx_walk.algos.ppo import PPOConfig, make_ppo
+from mjx_walk.algos.ppo import PPO, PPOConfig
 from mjx_walk.common import networks, returns
 from mjx_walk.envs import make_env
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
@@ -38,7 +39,7 @@ def test_ppo_update_equals_brax(monkeypatch):
     """
     config = dataclasses.replace(SMALL, entropy_coef=0.0, observation_clip=None, init_at_random_episode_step=False)
     task = make_env("walker2d", physics="c")
-    algorithm = make_ppo(task, 32, EvaluationConfig(1), config)
+    algorithm = PPO(task, 32, EvaluationConfig(1), config)
     state, batch = jax.jit(algorithm.collect)(jax.jit(algorithm.init)(jax.random.PRNGKey(0)))
 
     def fixed_order(key, x, *args, **kwargs):
@@ -46,6 +47,7 @@ def test_ppo_update_equals_brax(monkeypatch):
 
     monkeypatch.setattr(jax.random, "permutation", fixed_order)
     ours, metrics = jax.jit(algorithm.learn)(state, batch)
+    metrics = values(metrics)
 
     data = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batch.transitions)  # [T, B, …]
     last = jnp.broadcast_to(data.next_observation, data.observation.shape)
@@ -91,12 +93,13 @@ def test_small_batch_training_learns(physics):
     """Sixteen copies of a walker that is paid for standing learn to stand longer, on every engine."""
     task = make_env("walker2d", physics=physics, forward_reward_weight=0.0)
     config = dataclasses.replace(SMALL, unroll_length=32, num_epochs=8, learning_rate=3e-3, discount=0.95)
-    algorithm = make_ppo(task, 16, EvaluationConfig(2), config)
+    algorithm = PPO(task, 16, EvaluationConfig(2), config)
     state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
     collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
     lengths = []
     for _ in range(14):
         state, metrics = learn(*collect(state))
+        metrics = values(metrics)
         lengths.append((float(metrics["length"]), float(metrics["episodes"])))
         assert metrics["nonfinite"] == 0 and metrics["overflow"] == 0
     early, late = np.sum(lengths[:4], axis=0), np.sum(lengths[-4:], axis=0)
@@ -113,12 +116,13 @@ def test_small_batch_training_learns(physics):
 def test_options_train(changes):
     task = make_env("walker2d", physics="c")
     config = dataclasses.replace(SMALL, normalizer_warmup_steps_per_env=12, num_minibatches=2, **changes)
-    algorithm = make_ppo(task, 8, EvaluationConfig(1), config)
+    algorithm = PPO(task, 8, EvaluationConfig(1), config)
     state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
     collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
     for update in range(4):
         before = state.params
         state, metrics = learn(*collect(state))
+        metrics = values(metrics)
         if update < 2:  # of 8 steps each
             jax.tree.map(np.testing.assert_array_equal, before, state.params)
             assert np.isnan(metrics["loss"]) and (state.normalizer.std != 1.0).all()
@@ -136,11 +140,12 @@ def test_linear_schedule_has_its_own_horizon():
     task = make_env("walker2d", physics="c")
     horizon = 8 * 8 * 4  # four updates
     config = dataclasses.replace(SMALL, num_minibatches=2, learning_rate_schedule="linear", schedule_steps=horizon)
-    algorithm = make_ppo(task, 8, EvaluationConfig(1), config)
+    algorithm = PPO(task, 8, EvaluationConfig(1), config)
     state, rates = jax.jit(algorithm.init)(jax.random.PRNGKey(0)), []
     collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
     for _ in range(5):
         state, metrics = learn(*collect(state))
+        metrics = values(metrics)
         rates.append(float(metrics["learning_rate"]) / config.learning_rate)
     np.testing.assert_allclose(rates, [1.0, 0.75, 0.5, 0.25, 0.0], atol=1e-6)
 
@@ -151,7 +156,7 @@ def test_a_step_that_is_cut_off_is_paid_the_lost_value_and_one_that_terminates_i
     config = dataclasses.replace(
         SMALL, unroll_length=4, init_at_random_episode_step=False, reward_scale=0.5, discount=0.9
     )
-    algorithm = make_ppo(task, 4, EvaluationConfig(1), config)
+    algorithm = PPO(task, 4, EvaluationConfig(1), config)
     state = algorithm.init(jax.random.PRNGKey(0))
     value_params = jax.tree.map(lambda x: x + 0.1, state.params.value)  # which are worth nothing at an observation of 0
     state = state.replace(params=state.params.replace(value=value_params))
@@ -181,7 +186,7 @@ def test_the_entropy_bonus_falls_and_rewards_are_normalised_by_what_was_seen_bef
         told = {"v_loss": jnp.float32(entropy_cost), "policy_loss": jnp.float32(reward_scaling)}
         return zero, dict.fromkeys(names, zero) | told
 
-    monkeypatch.setattr("mjx_walk.algos.ppo.ppo_losses.compute_ppo_loss", loss)
+    monkeypatch.setattr("mjx_walk.common.brax_losses.ppo_losses.compute_ppo_loss", loss)
     settings = {
         "unroll_length": 4,
         "num_minibatches": 1,
@@ -191,12 +196,13 @@ def test_the_entropy_bonus_falls_and_rewards_are_normalised_by_what_was_seen_bef
     }
     schedule = {"entropy_coef": 0.5, "entropy_schedule": "linear", "schedule_steps": 2 * 4 * 4}
     config = dataclasses.replace(SMALL, **settings, **schedule)
-    algorithm = make_ppo(EndlessReward(), 4, EvaluationConfig(1), config)
+    algorithm = PPO(EndlessReward(), 4, EvaluationConfig(1), config)
     state, costs = algorithm.init(jax.random.PRNGKey(0)), []
     collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
     for _ in range(3):
         expected = 2.0 * float(returns.reward_multiplier(state.return_scale))
         state, metrics = learn(*collect(state))
+        metrics = values(metrics)
         costs.append(float(metrics["value_loss"]))
         assert float(metrics["policy_loss"]) == pytest.approx(expected, rel=1e-5)
     np.testing.assert_allclose(costs, [0.5, 0.25, 0.0])

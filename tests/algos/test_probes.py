@@ -11,10 +11,9 @@ import toy_tasks
 from brax.training.acme import running_statistics
 
 from mjx_walk.algos import ALGORITHMS
-from mjx_walk.algos.csac import make_csac_networks
 from mjx_walk.common import networks
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
-from mjx_walk.training.trainer import make_chunk, make_init
+from mjx_walk.training.programs import make_init, make_step
 
 # A chunk that is vmapped cannot reuse its input's memory.
 pytestmark = pytest.mark.filterwarnings("ignore:Some donated buffers")
@@ -71,11 +70,10 @@ def values(name, task, config, state, obs):
     if name in ("ppo", "a2c"):
         nets = networks.make_ppo_networks(task, config)
         return nets.value_network.apply(state.normalizer, state.params.value, obs)
-    action = ALGORITHMS[name][0](task, 8, EvaluationConfig(1), config).policy(
-        (state.normalizer, state.learner.policy), deterministic=True
-    )(obs, jax.random.PRNGKey(0))
+    algorithm = ALGORITHMS[name][0](task, 8, EvaluationConfig(1), config)
+    action = algorithm.policy(algorithm.policy_params(state))(obs, jax.random.PRNGKey(0))
     if name == "csac":
-        critics = make_csac_networks(task, config)[0].q_network
+        critics = algorithm.nets.q_network
     else:
         critics = networks.make_deterministic_networks(task, config, 1 if name == "ddpg" else 2)[1]
     obs = running_statistics.normalize(obs, state.normalizer)
@@ -87,11 +85,11 @@ def train(name, task, **changes):
     make, config_class = ALGORITHMS[name]
     config = config_class(**SETTINGS[name] | changes)
     algorithm = make(task, 32, EvaluationConfig(1), config)
-    state = make_init(algorithm)(jax.random.PRNGKey(0))
-    state, metrics = make_chunk(algorithm, UPDATES[name], fused=True)(state)
+    state = make_init(algorithm.init)(jax.random.PRNGKey(0))
+    state, metrics = make_step(algorithm.collect, algorithm.learn, UPDATES[name], fused=True)(state)
     obs = jnp.float32([[-1.0], [0.0], [1.0]])
     action = algorithm.policy(algorithm.policy_params(state), deterministic=True)(obs, jax.random.PRNGKey(0))
-    return values(name, task, config, state, obs), action[:, 0], jnp.isfinite(metrics["episodes"]).all()
+    return values(name, task, config, state, obs), action[:, 0], jnp.isfinite(metrics["episodes"].value).all()
 
 
 @functools.cache
@@ -138,7 +136,9 @@ def test_an_entropy_that_changes():
     config = config_class(**OFF_POLICY | changes | {"init_alpha": 0.1, "alpha_learning_rate": 3e-3})
     task = toy_tasks.RewardedAction(10)
     algorithm = make(task, 32, EvaluationConfig(1), config)
-    state, _ = make_chunk(algorithm, 2100, fused=True)(make_init(algorithm)(jax.random.PRNGKey(0)))
+    state, _ = make_step(algorithm.collect, algorithm.learn, 2100, fused=True)(
+        make_init(algorithm.init)(jax.random.PRNGKey(0))
+    )
     nets = networks.make_sac_networks(task, config)
     logits = nets.policy_network.apply(None, state.learner.policy, jnp.zeros((10_000, 1)))
     raw_action = nets.parametric_action_distribution.sample_no_postprocessing(logits, jax.random.PRNGKey(1))
@@ -209,7 +209,10 @@ def test_mountain_car_is_solved(name):
     make, config_class = ALGORITHMS[name]
     config = config_class(**SETTINGS[name] | changes | own.get(name, {"max_exploration_noise": 1.0}))
     algorithm = make(toy_tasks.MountainCar(), 64, EvaluationConfig(8), config)
-    _, metrics = make_chunk(algorithm, 700, fused=True)(make_init(algorithm)(jax.random.PRNGKey(0)))
-    scores = metrics["eval_return"][~jnp.isnan(metrics["eval_return"])]
+    _, metrics = make_step(algorithm.collect, algorithm.learn, 700, fused=True)(
+        make_init(algorithm.init)(jax.random.PRNGKey(0))
+    )
+    scores = metrics["eval_return"].value
+    scores = scores[~jnp.isnan(scores)]
     assert scores[-1] > 90 > 10 > scores[0]
-    assert metrics["replay_transitions"][-1] == 200_192
+    assert metrics["replay_transitions"].value[-1] == 200_192

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import values
 from toy_tasks import DelayedReward, EndlessReward
 
-from mjx_walk.algos.reinforce import REINFORCEConfig, linear_fit, make_reinforce
+from mjx_walk.algos.reinforce import REINFORCE, REINFORCEConfig, linear_fit
 from mjx_walk.common import networks
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 
@@ -25,9 +26,9 @@ SETTINGS = {
 def learned(task, **changes):
     """Config, state, batch and metrics of one update."""
     config = REINFORCEConfig(**SETTINGS, **changes)
-    algorithm = make_reinforce(task, NUM_ENVS, EvaluationConfig(1), config)
+    algorithm = REINFORCE(task, NUM_ENVS, EvaluationConfig(1), config)
     state, batch = jax.jit(algorithm.collect)(jax.jit(algorithm.init)(jax.random.PRNGKey(0)))
-    return config, state, batch, jax.jit(algorithm.learn)(state, batch)[1]
+    return config, state, batch, values(jax.jit(algorithm.learn)(state, batch)[1])
 
 
 def test_loss_over_the_steps_whose_future_was_seen():

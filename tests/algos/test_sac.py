@@ -8,10 +8,11 @@ import pytest
 from brax.training import acting
 from brax.training.agents.sac import networks as brax_networks
 from brax.training.agents.sac import train as brax_sac
+from helpers import values
 from toy_tasks import BraxSizes, ToyTask
 
 from mjx_walk.algos.off_policy import Batch
-from mjx_walk.algos.sac import SACConfig, make_sac, make_sac_learner
+from mjx_walk.algos.sac import SAC, SACConfig
 from mjx_walk.common.replay_buffer import ReplayBuffer
 from mjx_walk.envs import make_env
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
@@ -40,7 +41,7 @@ def test_sac_update_equals_brax(monkeypatch):
         critic_hidden_layer_sizes=(32, 32),
     )
     task = make_env("walker2d", physics="c")
-    algorithm = make_sac(task, NUM_ENVS, EvaluationConfig(1), config)
+    algorithm = SAC(task, NUM_ENVS, EvaluationConfig(1), config)
     state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
     collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
     for _ in range(4):
@@ -54,6 +55,7 @@ def test_sac_update_equals_brax(monkeypatch):
     monkeypatch.setattr(jax.random, "normal", lambda key, shape: jnp.sin(jnp.arange(np.prod(shape)).reshape(shape)))
     # A new function: the one above is traced already, without the patches.
     ours, metrics = jax.jit(lambda *args: algorithm.learn(*args))(state, (steps, stats))
+    metrics = values(metrics)
     assert int(ours.critic_updates - state.critic_updates) == UPDATES
 
     begin = brax_sac._init_training_state
@@ -136,9 +138,9 @@ def batch(remaining=1.0):
 
 def test_the_target_entropy_moves_over_the_schedule():
     """A new policy has less than 0.68 nats and more than -100, which is two thirds of the way at the half still."""
-    learner = make_sac_learner(ToyTask(), SACConfig(target_entropy=-100.0, final_target_entropy=0.68))
-    state = learner.init(jax.random.PRNGKey(0))
-    update = jax.jit(lambda left: learner.full_update(state, batch(left), jax.random.PRNGKey(0))[0].log_alpha)
+    algorithm = SAC(ToyTask(), 2, EvaluationConfig(1), SACConfig(target_entropy=-100.0, final_target_entropy=0.68))
+    state = algorithm.init_learner(jax.random.PRNGKey(0))
+    update = jax.jit(lambda left: algorithm.full_update(state, batch(left), jax.random.PRNGKey(0))[0].log_alpha)
     moved = [float(update(jnp.float32(left)) - state.log_alpha) for left in (1.0, 0.5, 0.0)]
     assert moved[0] < 0 and moved[1] < 0 < moved[2]
 
@@ -146,11 +148,11 @@ def test_the_target_entropy_moves_over_the_schedule():
 def test_sac_gradients_are_clipped():
     """Adam's first moments are a tenth of them."""
     for limit, is_clipped in ((1e-3, True), (None, False)):
-        learner = make_sac_learner(ToyTask(), SACConfig(max_grad_norm=limit))
-        state = learner.init(jax.random.PRNGKey(0))
+        algorithm = SAC(ToyTask(), 2, EvaluationConfig(1), SACConfig(max_grad_norm=limit))
+        state = algorithm.init_learner(jax.random.PRNGKey(0))
         data = batch()._replace(reward_scale=jnp.float32(1.0))
         data = data._replace(transitions=data.transitions._replace(reward=jnp.full(64, 100.0)))
-        after, _ = jax.jit(learner.full_update)(state, data, jax.random.PRNGKey(0))
+        after, _ = jax.jit(algorithm.full_update)(state, data, jax.random.PRNGKey(0))
         moments = [optax.tree.get(after.critic_optimizer, "mu"), optax.tree.get(after.policy_optimizer, "mu")]
         norms = [float(optax.global_norm(part)) for part in moments]
         assert (max(norms) < 1.01e-4) is is_clipped and min(norms) > 0

@@ -7,9 +7,10 @@ import optax
 import pytest
 from toy_tasks import ToyTask
 
-from mjx_walk.algos.ddpg import DDPGConfig
+from mjx_walk.algos.ddpg import DDPG, DDPGConfig
 from mjx_walk.algos.off_policy import Batch
-from mjx_walk.algos.td3 import TD3Config, make_deterministic_learner
+from mjx_walk.algos.td3 import TD3, TD3Config
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.types import Transition
 
 LINEAR = {
@@ -44,21 +45,21 @@ def loud_noise(monkeypatch):
     monkeypatch.setattr(jax.random, "normal", lambda key, shape: jnp.full(shape, 4.0))
 
 
-def make(config, num_critics, *smoothing):
-    learner = make_deterministic_learner(ToyTask(), 2, config, num_critics, *smoothing)
-    state = learner.init(jax.random.PRNGKey(0))
+def make(algorithm_class, config):
+    algorithm = algorithm_class(ToyTask(), 2, EvaluationConfig(1), config)
+    state = algorithm.init_learner(jax.random.PRNGKey(0))
     state = state.replace(policy=jax.tree.map(jnp.zeros_like, state.policy))
-    return learner, state.replace(target_policy=state.policy)
+    return algorithm, state.replace(target_policy=state.policy)
 
 
 def test_td3_critic_update(loud_noise):
     """Target action: tanh(0) + clip(0.2 · 4, ±0.5) = 0.5. Targets' values there: 1 + 2 · 0.5 = 2 and 1 − 2 · 0.5 + 1
     = 1, of which 1 counts. So y = 2 · 3 + 0.45 · 1 = 6.45 and, terminated, 6."""
-    learner, state = make(TD3Config(**LINEAR), 2, 0.2, 0.5)
+    algorithm, state = make(TD3, TD3Config(**LINEAR))
     state = state.replace(
         critic=critic((0.0, 2.0, 0.0), (0.0, 0.0, 1.0)), target_critic=critic((1.0, 2.0, 0.0), (1.0, -2.0, 1.0))
     )
-    new, metrics = learner.critic_update(state, batch(), jax.random.PRNGKey(0))
+    new, metrics = algorithm.critic_update(state, batch(), jax.random.PRNGKey(0))
     first, second = 0.5, 1.0  # what the two critics say now
     expected = np.mean([(first - 6.45) ** 2, (first - 6.0) ** 2]) + np.mean([(second - 6.45) ** 2, (second - 6.0) ** 2])
     assert metrics["critic_loss"] == pytest.approx(expected, rel=1e-6)
@@ -71,11 +72,11 @@ def test_td3_critic_update(loud_noise):
 
 
 def test_td3_full_update_moves_policy_and_targets(loud_noise):
-    learner, state = make(TD3Config(**LINEAR), 2, 0.2, 0.5)
+    algorithm, state = make(TD3, TD3Config(**LINEAR))
     state = state.replace(
         critic=critic((0.0, 2.0, 0.0), (0.0, -9.0, 1.0)), target_critic=critic((1.0, 2.0, 0.0), (1.0, -2.0, 1.0))
     )
-    new, _ = learner.full_update(state, batch(), jax.random.PRNGKey(0))
+    new, _ = algorithm.full_update(state, batch(), jax.random.PRNGKey(0))
     # The policy climbs the first critic, whose value rises with the action.
     layer = new.policy["params"]["hidden_0"]
     assert float(layer["bias"][0]) == pytest.approx(0.01, rel=1e-4) and float(layer["kernel"][0, 0]) == 0.0
@@ -89,8 +90,8 @@ def test_td3_full_update_moves_policy_and_targets(loud_noise):
 
 def test_td3_gradients_are_clipped(loud_noise):
     """Adam's first moments are a tenth of them."""
-    learner, state = make(TD3Config(**LINEAR, max_grad_norm=1e-3), 2, 0.2, 0.5)
-    new, _ = learner.full_update(state, batch(), jax.random.PRNGKey(0))
+    algorithm, state = make(TD3, TD3Config(**LINEAR, max_grad_norm=1e-3))
+    new, _ = algorithm.full_update(state, batch(), jax.random.PRNGKey(0))
     for optimizer in (new.critic_optimizer, new.policy_optimizer):
         assert 0 < float(optax.global_norm(optax.tree.get(optimizer, "mu"))) < 1.01e-4
 
@@ -98,17 +99,19 @@ def test_td3_gradients_are_clipped(loud_noise):
 def test_ddpg_has_one_critic_and_no_smoothing(loud_noise):
     """Target action 0, so y = 6 + 0.45 · (1 + 0) and 6."""
     assert DDPGConfig().policy_delay == 1
-    learner, state = make(DDPGConfig(**LINEAR), 1, 0.0, 0.0)
+    algorithm, state = make(DDPG, DDPGConfig(**LINEAR))
     assert state.critic["params"]["hidden_0"]["bias"].shape == (1, 1)
     state = state.replace(critic=critic((0.0, 2.0, 0.0)), target_critic=critic((1.0, 2.0, 0.0)))
-    _, metrics = learner.critic_update(state, batch(), jax.random.PRNGKey(0))
+    _, metrics = algorithm.critic_update(state, batch(), jax.random.PRNGKey(0))
     assert metrics["critic_loss"] == pytest.approx(np.mean([(0.5 - 6.45) ** 2, (0.5 - 6.0) ** 2]), rel=1e-6)
 
 
 def test_each_copy_explores_with_its_own_noise():
     config = TD3Config(**LINEAR, min_exploration_noise=0.0, max_exploration_noise=0.2)
-    learner, state = make(config, 2, 0.2, 0.5)
+    algorithm, state = make(TD3, config)
     obs = jnp.zeros((2, 1))
-    draws = jax.vmap(lambda key: learner.explore(state.policy, obs, key))(jax.random.split(jax.random.PRNGKey(1), 2000))
+    draws = jax.vmap(lambda key: algorithm.explore(state.policy, obs, key))(
+        jax.random.split(jax.random.PRNGKey(1), 2000)
+    )
     np.testing.assert_allclose(draws.std(axis=0)[:, 0], [0.0, 0.2], rtol=0.1)
-    assert (learner.act(state.policy, obs, jax.random.PRNGKey(0), True) == 0).all()
+    assert (algorithm.act(state.policy, obs, jax.random.PRNGKey(0), True) == 0).all()

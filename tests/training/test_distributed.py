@@ -13,17 +13,21 @@ import pytest
 from helpers import ENVIRONMENT, TINY, TINY_CHUNK, TINY_OFF_POLICY, command
 from toy_tasks import ObservedReward
 
+from mjx_walk.algos import make_algorithm
 from mjx_walk.algos.off_policy import OffPolicyConfig
-from mjx_walk.algos.ppo import PPOConfig, make_ppo
+from mjx_walk.algos.ppo import PPO, PPOConfig
 from mjx_walk.common import networks, returns
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.runs import checkpoint
+from mjx_walk.runs.config import load_config
 from mjx_walk.runs.metrics import read_rows
-from mjx_walk.training.distributed import OWN, in_place, per_device
+from mjx_walk.runs.policies import make_task
+from mjx_walk.training.distributed import Processes, in_place, per_device
 from mjx_walk.training.distributed_checkpoint import restore_newest
-from mjx_walk.training.trainer import make_init
-from mjx_walk.utils.collectives import AXIS
+from mjx_walk.training.programs import make_init
+from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.types import has_mark
 
 KEY = jax.random.PRNGKey(0)
 CHUNK = 2 * TINY_CHUNK
@@ -58,14 +62,17 @@ def test_two_devices_learn_what_one_learns_from_both_batches():
         normalize_rewards=True,
         **settings,
     )
-    algorithm = make_ppo(ObservedReward(), 16, EvaluationConfig(1), config)
+    algorithm = PPO(ObservedReward(), 16, EvaluationConfig(1), config)
+    on_devices = PPO(ObservedReward(), 16, EvaluationConfig(1), config, axis_name=DEVICES)
     state, batch = jax.jit(algorithm.collect)(algorithm.init(KEY))
     alone, _ = jax.jit(algorithm.learn)(state, batch)
     parts = twice(batch).replace(
         transitions=halves(batch.transitions), rewards=by_copy(batch.rewards), ended=by_copy(batch.ended)
     )
     scale = twice(state.return_scale).replace(running_return=halves(state.return_scale.running_return))
-    together, _ = jax.jit(jax.vmap(algorithm.learn, axis_name=AXIS))(twice(state).replace(return_scale=scale), parts)
+    together, _ = jax.jit(jax.vmap(on_devices.learn, axis_name=DEVICES))(
+        twice(state).replace(return_scale=scale), parts
+    )
     for name in ("params", "optimizer", "normalizer"):
         both = getattr(together, name)
         assert_close(jax.tree.map(lambda x: x[0], both), jax.tree.map(lambda x: x[1], both))
@@ -84,20 +91,25 @@ def test_running_statistics_are_of_all_devices():
     ended = reward > 1.0
     normalizer = networks.init_normalizer(3)
     alone = networks.update_normalizer(normalizer, obs)
-    together = jax.vmap(networks.update_normalizer, axis_name=AXIS)(twice(normalizer), halves(obs))
+    together = jax.vmap(lambda *of_device: networks.update_normalizer(*of_device, DEVICES), axis_name=DEVICES)(
+        twice(normalizer), halves(obs)
+    )
     assert_close(jax.tree.map(lambda x: x[1], together), alone)
-    update = lambda scale, reward, ended: returns.update_return_scale(scale, reward, ended, 0.9)  # noqa: E731
-    whole = update(returns.init_return_scale(8), reward, ended)
-    parts = jax.vmap(update, axis_name=AXIS)(twice(returns.init_return_scale(4)), by_copy(reward), by_copy(ended))
+
+    def update(scale, reward, ended):
+        return returns.update_return_scale(scale, reward, ended, 0.9, DEVICES)
+
+    whole = returns.update_return_scale(returns.init_return_scale(8), reward, ended, 0.9)
+    parts = jax.vmap(update, axis_name=DEVICES)(twice(returns.init_return_scale(4)), by_copy(reward), by_copy(ended))
     for name in ("count", "mean", "variance"):
         np.testing.assert_allclose(getattr(parts, name)[0], getattr(whole, name), rtol=1e-4)
 
 
 def test_what_a_device_gathers_stays_in_the_memory_of_what_it_had_gathered_before():
     config = PPOConfig(unroll_length=4, num_unrolls=1, num_minibatches=1)
-    algorithm = make_ppo(ObservedReward(), 16, EvaluationConfig(1), config)
+    algorithm = PPO(ObservedReward(), 16, EvaluationConfig(1), config)
     act = in_place(algorithm.collect)
-    state = make_init(algorithm)(KEY)
+    state = make_init(algorithm.init)(KEY)
     fresh = jax.jit(algorithm.collect)(state)
     state, batch = act(state, jax.tree.map(jnp.zeros_like, fresh[1]))
     assert_close((state, batch), fresh)
@@ -112,7 +124,7 @@ def test_what_a_device_gathers_stays_in_the_memory_of_what_it_had_gathered_befor
 def test_a_checkpoint_of_another_run_is_refused_not_passed_over(tmp_path):
     checkpoint.save(checkpoint.step_path(tmp_path, 10), {"a": np.zeros(3)}, {"env_steps": 10})
     with pytest.raises(UserError, match="is of another run"):
-        restore_newest(tmp_path, {"a": np.zeros(4)}, None)
+        restore_newest(tmp_path, {"a": np.zeros(4)}, Processes())
 
 
 def run(run_dir, *arguments, tiny=TINY, devices=2):
@@ -131,15 +143,23 @@ def newest(run_dir):
     return found
 
 
+def own_leaves(tiny):
+    """Whether each leaf of the TrainState is marked as a device's own, by its path."""
+    config = load_config([*tiny, "hardware=cpu"])
+    algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
+    marks = has_mark(jax.eval_shape(algorithm.init, KEY), "per_device")
+    return checkpoint._named_leaves(marks)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("tiny", [TINY, (*TINY_OFF_POLICY, "algo=sac")])
 def test_two_processes_learn_the_same_and_resume_exactly(tmp_path, tiny):
     scored = run(tmp_path / "whole", f"total_steps={4 * CHUNK}", "evaluation.gymnasium_episodes=1", tiny=tiny)
     assert "2 ×" in scored.stdout and "In the real Gymnasium" in scored.stdout
     first, second = newest(tmp_path / "whole")
+    is_own = own_leaves(tiny)
     for name, leaf in first.items():
-        is_own = name.split(".")[0] in OWN or name == "return_scale.running_return"
-        assert is_own or np.array_equal(leaf, second[name]), name
+        assert is_own[name] or np.array_equal(leaf, second[name]), name
     assert not np.array_equal(first["env.env.obs"], second["env.env.obs"])
     assert [row["env_steps"] for row in read_rows(tmp_path / "whole" / "metrics.jsonl")] == [
         CHUNK,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from mjx_walk.algos import make_algorithm
-from mjx_walk.api import make_task
 from mjx_walk.evaluation.gymnasium_scores import Scores
 from mjx_walk.runs.config import load_config
-from mjx_walk.runs.policies import load_best_policy
+from mjx_walk.runs.policies import load_best_policy, make_task
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.training.distributed import Processes
 from mjx_walk.training.recorder import Recorder
 
 TINY = [
@@ -29,16 +29,16 @@ def run(tmp_path):
     folder = RunFolder(tmp_path)
     folder.checkpoints.mkdir()
     state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
-    return Recorder(config, task, algorithm, folder), algorithm, state, folder
+    return Recorder(config, task, algorithm, folder, Processes()), algorithm, state, folder
 
 
 def with_best(algorithm, state, best_return, best_iteration):
     """A state whose evaluations found a policy with all parameters 7 to be the best."""
     best = jax.tree.map(lambda x: jnp.full_like(x, 7), algorithm.policy_params(state))
-    live = state.env.live.replace(
+    evaluation = state.evaluation.replace(
         best_policy_params=best, best_return=jnp.float32(best_return), best_iteration=jnp.int32(best_iteration)
     )
-    return state.replace(env=state.env.replace(live=live)), best
+    return state.replace(evaluation=evaluation), best
 
 
 def kept(folder, algorithm, state):
@@ -83,8 +83,8 @@ def test_of_the_last_policy_and_the_best_one_gymnasium_chooses(run, monkeypatch,
         return Scores(np.full(num_episodes, best if is_best else last), np.full(num_episodes, 3), [0], "Walker2d-v5")
 
     monkeypatch.setattr(recorder, "_score_in_gymnasium", score)
-    monkeypatch.setattr("mjx_walk.plots.plot_run", lambda folder: None)
-    recorder.begin(0, trains_on=True)
+    monkeypatch.setattr("mjx_walk.viewing.curves.plot_run", lambda folder: None)
+    recorder.begin(0, will_train=True)
     recorder.end(state, env_steps=80)
     scores = recorder.score(wall_seconds=1.0)
     recorder.wait()

@@ -9,10 +9,10 @@ from helpers import TINY, TINY_CHUNK
 import mjx_walk
 from mjx_walk import train as train_command
 from mjx_walk.algos import make_algorithm
-from mjx_walk.api import make_task
 from mjx_walk.runs.config import load_config
-from mjx_walk.training import trainer
-from mjx_walk.training.trainer import make_chunk, make_init
+from mjx_walk.runs.policies import make_task
+from mjx_walk.training import programs
+from mjx_walk.training.programs import make_init, make_step
 from mjx_walk.utils.errors import UserError
 
 
@@ -37,13 +37,13 @@ def test_nothing_is_compiled_twice():
 
     task.step = counted
     algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
-    chunk = make_chunk(algorithm, 2, fused=True)
-    state = make_init(algorithm)(jax.random.PRNGKey(0))
+    chunk = make_step(algorithm.collect, algorithm.learn, 2, fused=True)
+    state = make_init(algorithm.init)(jax.random.PRNGKey(0))
     state, _ = chunk(state)
     after_first = traces
     for _ in range(3):
         state, metrics = chunk(state)
-    assert traces == after_first and metrics["loss"].shape == (2,)
+    assert traces == after_first and metrics["loss"].value.shape == (2,)
     assert chunk._cache_size() == 1
 
 
@@ -52,15 +52,15 @@ def test_a_chunk_is_told_before_the_next_begins(tmp_path, monkeypatch):
     events = []
 
     def counted(*args, **kwargs):
-        chunk = make_chunk(*args, **kwargs)
+        step = make_step(*args, **kwargs)
 
         def begin(state):
             events.append("begins")
-            return chunk(state)
+            return step(state)
 
         return begin
 
-    monkeypatch.setattr(trainer, "make_chunk", counted)
+    monkeypatch.setattr(programs, "make_step", counted)
     overrides = [*TINY, f"run_dir={tmp_path / 'run'}", f"total_steps={3 * TINY_CHUNK}"]
     mjx_walk.run(overrides, on_metrics=lambda row: events.append("is told"))
     assert events == 3 * ["begins", "is told"]
@@ -91,8 +91,8 @@ def test_training_that_diverges_stops_and_keeps_what_was_saved_before(tmp_path):
 def test_of_seeds_side_by_side_those_that_are_sound_are_saved(tmp_path, monkeypatch):
     """The second one's policy is broken from the start."""
 
-    def broken(algorithm):
-        init = make_init(algorithm)
+    def broken(init):
+        init = make_init(init)
 
         def break_second(key):
             state = init(key)
@@ -101,7 +101,7 @@ def test_of_seeds_side_by_side_those_that_are_sound_are_saved(tmp_path, monkeypa
 
         return break_second
 
-    monkeypatch.setattr(trainer, "make_init", broken)
+    monkeypatch.setattr(programs, "make_init", broken)
     with pytest.raises(UserError, match="the policy of seed 5 is not finite"):
         train_command.main([*TINY, f"run_dir={tmp_path}", "seeds=[3,5]", f"total_steps={50 * TINY_CHUNK}"])
     assert len(list((tmp_path / "seed_3" / "checkpoints").glob("0*"))) == 1

@@ -3,13 +3,13 @@
 import jax.numpy as jnp
 import pytest
 
-from mjx_walk.common.schedules import anneal, anneal_discount, factor
+from mjx_walk.common.optimizers import anneal_discount, remaining_fraction, schedule_factor
 
 
 def test_a_schedule_ends_at_its_horizon():
-    left = [float(anneal(jnp.float32(steps), 200)) for steps in (0, 50, 200, 300)]
+    left = [float(remaining_fraction(jnp.float32(steps), 200)) for steps in (0, 50, 200, 300)]
     assert left == pytest.approx([1.0, 0.75, 0.0, 0.0])
-    assert factor("linear", 0.25) == 0.25 and factor("constant", 0.25) == 1.0
+    assert schedule_factor("linear", 0.25) == 0.25 and schedule_factor("constant", 0.25) == 1.0
 
 
 def test_a_discounts_horizon_changes_by_the_same_factor_every_step():
