@@ -9,8 +9,9 @@ import jaxtyping
 import numpy as np
 import pytest
 from shapes import check_shapes
+from toy_tasks import MountainCar
 
-from mjx_walk.envs import TASKS, make_env
+from mjx_walk.envs import TASKS, TrainableTask, make_env
 from mjx_walk.envs.physics import base
 from mjx_walk.utils.errors import UserError
 
@@ -23,6 +24,13 @@ def test_vmap_equals_separate_steps():
     for i in (0, 7, 19):
         alone = task.step(jax.tree.map(lambda x, i=i: x[i], states), actions[i])
         jax.tree.map(np.testing.assert_array_equal, alone, jax.tree.map(lambda x, i=i: x[i], together))
+
+
+@pytest.mark.parametrize("make", [lambda: make_env("walker2d", physics="c"), MountainCar])
+def test_tasks_have_the_attributes_that_trainers_need(make):
+    task = make()
+    assert all(hasattr(task, name) for name in TrainableTask.__annotations__)
+    np.testing.assert_array_equal(task.scale_action(2.0 * task.action_high), task.action_high)
 
 
 def test_nested_vmap_calls_a_batched_function_once():
