@@ -145,7 +145,8 @@ class Task(TrainableTask, abc.ABC):
         """
         if options.version not in self.XML_FILES:
             raise UserError(f"unknown version '{options.version}' of {options.name}; choose one of: v5, v4")
-        not_in_v4 = [name for name in self.V5_ONLY if name in options.changed()]
+        changed = options.changed()
+        not_in_v4 = [name for name in self.V5_ONLY if name in changed]
         if options.version == "v4" and not_in_v4:
             raise UserError(f"{options.name} v4 does not take {', '.join(not_in_v4)}; use version=v5")
         self.options = options

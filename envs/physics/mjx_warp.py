@@ -56,7 +56,7 @@ class WarpEngine:
     def _data(self, state: PhysicsState) -> mjx.Data:
         """Warp's data for the entire batch.
 
-        The program allocates the zero arrays itself, since large constants would slow down its compilation.
+        Most arrays are zeros. The program allocates them itself instead of holding them as constants.
         """
         num_envs = state.qpos.shape[0]
         with jax.ensure_compile_time_eval():
