@@ -2,18 +2,20 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
 
 from mjx_walk.envs.humanoid_body import HumanoidBody, HumanoidBodyOptions
 from mjx_walk.envs.physics import Derived, PhysicsState
-from mjx_walk.envs.task import Memory, State
+from mjx_walk.envs.rewards import Terms
+from mjx_walk.envs.task import Carry, State
 from mjx_walk.utils.settings import setting
 
 
 @dataclasses.dataclass
 class HumanoidOptions(HumanoidBodyOptions):
-    """Keywords of Gymnasium's `HumanoidEnv`. In v4 there is no contact cost, and its keywords have no effect."""
+    """Keyword arguments of Gymnasium's `HumanoidEnv`. v4 has no contact cost and does not take its options."""
 
     name: str = setting("humanoid", choices=("humanoid",))
     forward_reward_weight: float = 1.25
@@ -26,7 +28,10 @@ class HumanoidOptions(HumanoidBodyOptions):
 
 
 class Humanoid(HumanoidBody):
-    """Source: `gymnasium/envs/mujoco/humanoid_v5.py` and `humanoid_v4.py`."""
+    """Humanoid, which runs forward and must not fall.
+
+    Source: `gymnasium/envs/mujoco/humanoid_v5.py` and `humanoid_v4.py`.
+    """
 
     GYMNASIUM_NAME = "Humanoid"
     XML_FILES = {"v5": "humanoid.xml", "v4": "humanoid.xml"}
@@ -38,27 +43,31 @@ class Humanoid(HumanoidBody):
 
     options: HumanoidOptions
 
+    @property
+    def terminates_on_fall(self) -> bool:
+        return self.options.terminate_when_unhealthy
+
     def derived_names(self) -> tuple[str, ...]:
         return (*super().derived_names(), "xipos")
 
-    def remember(self, physics: PhysicsState, derived: Derived) -> Memory:
-        """The mass centre's x, y, which the next step's velocity is measured from."""
+    def carry(self, physics: PhysicsState, derived: Derived) -> Carry:
+        """Center of mass `[2]`, x and y in m. The next step's forward velocity is its displacement."""
         mass = jnp.asarray(self.model.body_mass, jnp.float32)
         return {"mass_center": (mass[:, None] * derived["xipos"]).sum(0)[:2] / mass.sum()}
 
     def reward_and_termination(
-        self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array
-    ):
+        self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
+    ) -> tuple[Terms, Float[Array, ""], Bool[Array, ""]]:
         options = self.options
         low, high = options.healthy_z_range
         is_healthy = (low < physics.qpos[2]) & (physics.qpos[2] < high)
         terminated = ~is_healthy & options.terminate_when_unhealthy
-        velocity = (memory["mass_center"][0] - before.memory["mass_center"][0]) / self.dt
+        velocity = (carry["mass_center"][0] - before.memory["mass_center"][0]) / self.dt
 
         forward = options.forward_reward_weight * velocity
         ctrl = -options.ctrl_cost_weight * jnp.square(action).sum()
         if options.version == "v4":
-            # v4 pays the healthy reward on the step that ends the episode, too.
+            # v4 also pays the healthy reward in the step that terminates the episode.
             alive = options.healthy_reward * (is_healthy | options.terminate_when_unhealthy)
             terms = {"reward_alive": alive, "reward_linvel": forward, "reward_quadctrl": ctrl}
         else:
@@ -70,4 +79,4 @@ class Humanoid(HumanoidBody):
                 "reward_ctrl": ctrl,
                 "reward_contact": contact,
             }
-        return terms, sum(terms.values()), terminated
+        return terms, sum(terms.values(), jnp.float32(0.0)), terminated

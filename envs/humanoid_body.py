@@ -1,21 +1,22 @@
-"""What Humanoid and HumanoidStandup share: the body and its observation."""
+"""The body of Humanoid and HumanoidStandup: its observation and its contact cost."""
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import mujoco
+from jax import Array
+from jaxtyping import Float
 
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.task import Task, TaskOptions
 
 NUM_ROOT_DOFS = 6
-"""Degrees of freedom of the free root joint, which has no motor."""
+"""Degrees of freedom of the root's free joint, which has no motor."""
 
 
 @dataclasses.dataclass
 class HumanoidBodyOptions(TaskOptions):
-    """Gymnasium's observation flags, v5 only."""
+    """Gymnasium's observation flags, which v4 does not take."""
 
     include_cinert_in_observation: bool = True
     include_cvel_in_observation: bool = True
@@ -24,7 +25,7 @@ class HumanoidBodyOptions(TaskOptions):
 
 
 class HumanoidBody(Task):
-    """Observation and contact cost of the 17-motor humanoid."""
+    """Observation and contact cost of the humanoid with 17 motors."""
 
     V5_ONLY = (
         *Task.V5_ONLY,
@@ -37,7 +38,7 @@ class HumanoidBody(Task):
     options: HumanoidBodyOptions
 
     def observed_arrays(self) -> tuple[str, ...]:
-        """The observation's `mjData` arrays after positions and velocities, in order."""
+        """Names of the `mjData` arrays that the observation holds after positions and velocities, in order."""
         flags = {
             "cinert": self.options.include_cinert_in_observation,
             "cvel": self.options.include_cvel_in_observation,
@@ -47,10 +48,11 @@ class HumanoidBody(Task):
         return tuple(name for name, is_included in flags.items() if is_included)
 
     def derived_names(self) -> tuple[str, ...]:
-        # The contact cost needs cfrc_ext even where it is not observed.
+        # The contact cost needs cfrc_ext even if the observation excludes it.
         return tuple(dict.fromkeys((*self.observed_arrays(), "cfrc_ext")))
 
     def _first_row(self, name: str) -> int:
+        """First observed row of an array. v5 skips the world body and the root joint, v4 includes them."""
         if self.options.version == "v4":
             return 0
         return NUM_ROOT_DOFS if name == "qfrc_actuator" else 1
@@ -61,16 +63,16 @@ class HumanoidBody(Task):
         blocks["qvel"] = self.model.nv
         return blocks | {name: getattr(blank, name)[self._first_row(name) :].size for name in self.observed_arrays()}
 
-    def observe(self, physics: PhysicsState, derived: Derived) -> jax.Array:
-        """`[348]` in v5: positions without x, y (22), velocities (23), then per body `cinert` (130), `cvel` (78),
-        motor torques (17) and contact forces `cfrc_ext` (78).
+    def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
+        """Observation, `[348]` in v5 and `[376]` in v4.
 
-        v4 keeps the world body's zero rows and the root's zero torques: `[376]`.
+        v5 holds positions without x and y (22), velocities (23), `cinert` (130), `cvel` (78), `qfrc_actuator` (17) and
+        `cfrc_ext` (78). v4 also holds the zero rows of the world body and the zero torques of the root joint.
         """
         blocks = [derived[name][self._first_row(name) :].ravel() for name in self.observed_arrays()]
         qpos = physics.qpos[2:] if self.options.exclude_current_positions_from_observation else physics.qpos
         return jnp.concatenate([qpos, physics.qvel, *blocks])
 
-    def contact_cost(self, derived: Derived, weight: float, bounds: tuple[float, float]) -> jax.Array:
-        """Penalty on the squared contact forces of all bodies, clipped; positive."""
+    def contact_cost(self, derived: Derived, weight: float, bounds: tuple[float, float]) -> Float[Array, ""]:
+        """Weighted sum of the squared contact forces on all bodies, clipped to `bounds`."""
         return jnp.clip(weight * jnp.square(derived["cfrc_ext"]).sum(), *bounds)

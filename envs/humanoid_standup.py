@@ -1,30 +1,35 @@
-"""HumanoidStandup: rise from lying on the back, and stay up."""
+"""HumanoidStandup: stand up from lying on the back, and keep standing."""
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
 
 from mjx_walk.envs.humanoid_body import HumanoidBody, HumanoidBodyOptions
 from mjx_walk.envs.physics import Derived, PhysicsState
-from mjx_walk.envs.task import Memory, State
+from mjx_walk.envs.rewards import Terms
+from mjx_walk.envs.task import Carry, State
 from mjx_walk.utils.settings import setting
 
 
 @dataclasses.dataclass
 class HumanoidStandupOptions(HumanoidBodyOptions):
-    """Keywords of Gymnasium's `HumanoidStandupEnv`. v4 takes none of them."""
+    """Keyword arguments of Gymnasium's `HumanoidStandupEnv`. v4 takes none of them."""
 
     name: str = setting("humanoid_standup", choices=("humanoid_standup",))
     uph_cost_weight: float = 1.0
-    """Stored and never used, as in Gymnasium."""
+    """Has no effect, as in Gymnasium."""
     ctrl_cost_weight: float = 0.1
     impact_cost_weight: float = 0.5e-6
     impact_cost_range: tuple[float, float] = (-float("inf"), 10.0)
 
 
 class HumanoidStandup(HumanoidBody):
-    """Source: `gymnasium/envs/mujoco/humanoidstandup_v5.py` and `humanoidstandup_v4.py`."""
+    """HumanoidStandup, whose episodes end only at the time limit.
+
+    Source: `gymnasium/envs/mujoco/humanoidstandup_v5.py` and `humanoidstandup_v4.py`.
+    """
 
     GYMNASIUM_NAME = "HumanoidStandup"
     XML_FILES = {"v5": "humanoidstandup.xml", "v4": "humanoidstandup.xml"}
@@ -42,13 +47,13 @@ class HumanoidStandup(HumanoidBody):
     options: HumanoidStandupOptions
 
     def reward_and_termination(
-        self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array
-    ):
+        self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
+    ) -> tuple[Terms, Float[Array, ""], Bool[Array, ""]]:
         options = self.options
         terms = {
-            # Divided by the physics step, not by the environment's.
+            # Gymnasium divides by the physics time step, not by `dt`.
             "reward_linup": physics.qpos[2] / self.model.opt.timestep,
             "reward_quadctrl": -options.ctrl_cost_weight * jnp.square(action).sum(),
             "reward_impact": -self.contact_cost(derived, options.impact_cost_weight, options.impact_cost_range),
         }
-        return terms, sum(terms.values()) + 1.0, jnp.zeros((), bool)
+        return terms, sum(terms.values(), jnp.float32(0.0)) + 1.0, jnp.zeros((), bool)

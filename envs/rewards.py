@@ -1,4 +1,4 @@
-"""Rewards beyond Gymnasium's: terms added by weight, or a function of your own. Scores in Gymnasium ignore them."""
+"""Reward shaping and custom reward functions, for training only: scores in Gymnasium use Gymnasium's reward."""
 
 import dataclasses
 import importlib.util
@@ -8,119 +8,126 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
 
-Terms = dict[str, jax.Array]
-"""Signed reward terms, `[] f32` each."""
+Terms = dict[str, Float[Array, ""]]
+"""Signed reward terms by name, `[] f32` each."""
 
 
 class RewardStep(NamedTuple):
-    """One step of one copy, as a reward sees it."""
+    """One step of one environment: the input of a reward function."""
 
     terms: Terms
-    """Gymnasium's."""
-    reward: jax.Array
-    """`[] f32`: Gymnasium's."""
+    """Gymnasium's reward terms."""
+    reward: Array
+    """`[] f32`: Gymnasium's reward."""
     before: PhysicsState
+    """Physics state before the step."""
     after: PhysicsState
-    """`qpos [nq]` in m and rad, `qvel [nv]` in m/s and rad/s."""
-    obs: jax.Array
+    """Physics state after the step: `qpos [nq]` in m and rad, `qvel [nv]` in m/s and rad/s."""
+    obs: Array
     """`[observation_size] f32`, after the step."""
-    action: jax.Array
+    action: Array
     """`[action_size] f32`, in Gymnasium's units."""
-    terminated: jax.Array
-    """`[] bool`."""
+    terminated: Array
+    """`[] bool`: whether the step terminated the episode."""
     dt: float
-    """Seconds."""
+    """Duration of the step, s."""
 
 
 RewardFunction = Callable[[RewardStep], Terms]
-"""Gives all terms; their sum is the reward."""
+"""Maps a step to its reward terms. The reward is their sum."""
 
 
 @dataclasses.dataclass
 class Shaping:
-    """Weights of terms added to the reward; 0 leaves a term out. x is forward, y to the left."""
+    """Weights of additional reward terms; 0 disables a term. x points forward, y to the left."""
 
     keep_y: float = setting(0.0, at_least=0)
-    """`exp(-y²)` at each step, y in m: for walking straight. Not in Walker2d, which has no y."""
+    """`exp(-y²)` with y in m, which rewards walking straight. Walker2d has no y."""
     shaking: float = setting(0.0, at_least=0)
-    """Minus the mean square of the last joint velocities, one for each motor, (rad/s)²."""
+    """Minus the mean squared velocity of the joints with a motor, (rad/s)²."""
     falling: float = setting(0.0, at_least=0)
-    """Minus one at the step that terminates the episode."""
+    """-1 in the step that terminates the episode."""
     backward: float = setting(0.0, at_least=0)
-    """Minus the root's speed where it moves backward, m/s."""
+    """Minus the root's backward speed, m/s."""
 
 
 def shaping_terms(shaping: Shaping, step: RewardStep) -> Terms:
-    """The terms whose weights are not 0."""
-    speed = (step.after.qpos[0] - step.before.qpos[0]) / step.dt
-    terms = {
-        "keep_y": lambda: jnp.exp(-jnp.square(step.after.qpos[1])),
-        "shaking": lambda: -jnp.square(step.after.qvel[-step.action.size :]).mean(),
-        "falling": lambda: -jnp.float32(step.terminated),
-        "backward": lambda: jnp.minimum(speed, 0.0),
-    }
-    weights = dataclasses.asdict(shaping)
-    return {f"reward_{name}": weights[name] * term() for name, term in terms.items() if weights[name]}
+    """Weighted shaping terms of a step, without the disabled ones."""
+    terms = {}
+    if shaping.keep_y:
+        terms["reward_keep_y"] = shaping.keep_y * jnp.exp(-jnp.square(step.after.qpos[1]))
+    if shaping.shaking:
+        terms["reward_shaking"] = shaping.shaking * -jnp.square(step.after.qvel[-step.action.size :]).mean()
+    if shaping.falling:
+        terms["reward_falling"] = shaping.falling * -jnp.float32(step.terminated)
+    if shaping.backward:
+        speed = (step.after.qpos[0] - step.before.qpos[0]) / step.dt
+        terms["reward_backward"] = shaping.backward * jnp.minimum(speed, 0.0)
+    return terms
 
 
 def reward_file(source: str) -> Path:
-    """The file in `PATH.py:FUNCTION`."""
+    """Path of the file in `PATH.py:FUNCTION`."""
     return Path(source.rpartition(":")[0]).expanduser()
 
 
 def load_reward_function(source: str) -> RewardFunction:
-    """Load a function from a Python file.
+    """Load a reward function from a Python file.
 
     Args:
         source: `PATH.py:FUNCTION`.
 
     Raises:
-        UserError: there is no such file or function, or the file cannot be run.
+        UserError: the file or the function does not exist, or the file raises an exception.
     """
     path, name = reward_file(source), source.rpartition(":")[2]
+    problem = f"env.reward_function={source}: "
     if not path.is_file():
-        raise UserError(
-            f"env.reward_function={source}: no file '{path if path.name else source}'; write PATH.py:FUNCTION"
-        )
+        raise UserError(f"{problem}no file '{path if path.name else source}'; write PATH.py:FUNCTION")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:
-        raise UserError(f"env.reward_function={source}: '{path}' is not a Python file")
+        raise UserError(f"{problem}'{path}' is not a Python file; write PATH.py:FUNCTION")
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise UserError(f"env.reward_function={source}: {type(error).__name__}: {error}") from error
-    if not callable(getattr(module, name, None)):
-        raise UserError(f"env.reward_function={source}: '{path}' has no function '{name}'")
-    return getattr(module, name)
+        raise UserError(f"{problem}{type(error).__name__}: {error}") from error
+    function = vars(module).get(name)
+    if not callable(function):
+        raise UserError(f"{problem}'{path}' has no function '{name}'")
+    return function
 
 
 def term_names(function: RewardFunction, source: str, example: RewardStep, shaped: Terms) -> tuple[str, ...]:
-    """The names of a reward function's terms, which it must give for every step.
+    """Names of the terms that a reward function returns, found by tracing it.
 
     Args:
-        function: as loaded.
-        source: where from.
-        example: a step of the right shapes.
-        shaped: the terms that are added to it.
+        function: the reward function.
+        source: `PATH.py:FUNCTION`, for error messages.
+        example: a step with the task's shapes.
+        shaped: the shaping terms, whose names the function must not use.
 
     Raises:
-        UserError: it fails, or does not give scalars by names of its own.
+        UserError: the function raises an exception, does not return a dict of scalars, or uses an invalid name.
     """
+    problem = f"env.reward_function={source}: "
     try:
         terms = jax.eval_shape(lambda step: function(step._replace(dt=example.dt)), example)
     except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else ""
-        raise UserError(f"env.reward_function={source}: {type(error).__name__}: {reason}") from error
+        raise UserError(f"{problem}{type(error).__name__}: {reason}") from error
     if not isinstance(terms, dict) or not terms or any(getattr(term, "shape", None) != () for term in terms.values()):
-        raise UserError(f"env.reward_function={source}: must return a dict of scalars by name")
+        raise UserError(f"{problem}must return a dict of scalars by name")
     for name in terms:
-        if not str(name).startswith("reward_") or name in shaped:
-            problem = "is one of env.shaping's" if name in shaped else "does not begin with reward_"
-            raise UserError(f"env.reward_function={source}: the term's name '{name}' {problem}; choose another")
+        if name in shaped:
+            raise UserError(f"{problem}env.shaping already has the term '{name}'; choose another name")
+        if not str(name).startswith("reward_"):
+            raise UserError(f"{problem}the term's name '{name}' must begin with reward_")
     return tuple(terms)

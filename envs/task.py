@@ -1,15 +1,18 @@
-"""What every task shares: the model, the engine, resets, the guard against broken physics, the time limit."""
+"""The contract of a task, and what all Gymnasium tasks share: model, engine, resets, finiteness check, time limit."""
 
 import abc
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import flax
 import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.rewards import RewardStep, Shaping, Terms, load_reward_function, shaping_terms, term_names
@@ -17,98 +20,137 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
 
 MAX_ABS_VALUE = 1e10
-"""A position or velocity beyond it is a broken simulation, as in MuJoCo's own check (`mjMAXVAL`)."""
+"""Largest valid position or velocity, as in MuJoCo's own check (`mjMAXVAL`)."""
 
 NO_TIME_LIMIT = 2**31 - 1
-"""`max_episode_steps` of a task whose time limit is kept by somebody else."""
+"""Value of `max_episode_steps` when a caller or a wrapper applies the time limit."""
 
-Memory = dict[str, jax.Array]
-"""What a task remembers from the last step beside the physics state."""
+Carry = dict[str, Array]
+"""Quantities of one step that the next step's reward needs, in addition to the physics state."""
+
+_NOT_IN_GYMNASIUM = ("name", "version", "max_episode_steps", "shaping", "reward_function")
+"""Fields of `TaskOptions` that the constructors of Gymnasium's classes do not take."""
 
 
 class State(flax.struct.PyTreeNode):
-    """One copy of an environment. Lean by design: everything else is rebuilt inside the step."""
+    """State of one environment. It holds no MuJoCo data: the engine rebuilds them in each step."""
 
     physics: PhysicsState
-    memory: Memory
-    obs: jax.Array
+    memory: Carry
+    """The task's carry. Checkpoints store it under this name."""
+    obs: Array
     """`[observation_size] f32`, in Gymnasium's order and units."""
-    reward: jax.Array
+    reward: Array
     """`[] f32`."""
-    terminated: jax.Array
-    """`[] bool`: the task ended the episode; there is no future reward."""
-    truncated: jax.Array
-    """`[] bool`: the time limit ended it; the future was cut off."""
-    steps: jax.Array
+    terminated: Array
+    """`[] bool`: the task ended the episode, so no reward follows."""
+    truncated: Array
+    """`[] bool`: the episode reached the time limit."""
+    steps: Array
     """`[] i32`: steps since the reset."""
-    metrics: dict[str, jax.Array]
-    """`[] f32` each: the reward terms under Gymnasium's `info` names, `nonfinite` and `overflow`."""
+    metrics: dict[str, Array]
+    """`[] f32` each: the reward terms under the names of Gymnasium's `info`, `nonfinite` and `overflow`."""
+
+
+class TrainableTask(Protocol):
+    """What a trainer needs of a task. All methods are pure functions of one unbatched environment."""
+
+    observation_size: int
+    action_size: int
+    action_low: Array
+    """`[action_size] f32`, in Gymnasium's units."""
+    action_high: Array
+    """`[action_size] f32`, in Gymnasium's units."""
+    reward_terms: tuple[str, ...]
+    """Names of the reward terms in `State.metrics`."""
+    max_episode_steps: int
+    """Time limit, after which `State.truncated` is set."""
+
+    def reset(self, key: PRNGKeyArray) -> State:
+        """Random initial state."""
+        ...
+
+    def step(self, state: State, action: Float[Array, " action_size"]) -> State:
+        """Next state. Its metrics hold the reward terms, `nonfinite` and `overflow`."""
+        ...
+
+    def scale_action(self, action: Float[Array, "*batch action_size"]) -> Float[Array, "*batch action_size"]:
+        """Actions in Gymnasium's units, from actions in [-1, 1]; values outside that range are clipped."""
+        center = (self.action_high + self.action_low) / 2
+        return center + (self.action_high - self.action_low) / 2 * jnp.clip(action, -1.0, 1.0)
 
 
 @dataclasses.dataclass
 class TaskOptions:
-    """Keywords that all tasks share. Each task's own class adds Gymnasium's, under Gymnasium's names."""
+    """Env options of all tasks. Subclasses add the keyword arguments of their Gymnasium class."""
 
     name: str = ""
     version: str = setting("v5", choices=("v5", "v4"))
     xml_file: str | None = None
-    """A model of your own, as in Gymnasium; by default the version's own file."""
+    """Model file, resolved as in Gymnasium. Default: the version's own model."""
     frame_skip: int = setting(5, at_least=1)
     reset_noise_scale: float = setting(1e-2, at_least=0)
     exclude_current_positions_from_observation: bool = True
     max_episode_steps: int = setting(1000, at_least=1)
     shaping: Shaping = dataclasses.field(default_factory=Shaping)
-    """Terms to add to the reward."""
+    """Weights of additional reward terms."""
     reward_function: str | None = None
-    """`PATH.py:FUNCTION`, a reward of your own instead of Gymnasium's; see `mjx_walk.envs.rewards`."""
+    """`PATH.py:FUNCTION`, a custom reward that replaces Gymnasium's; see `mjx_walk.envs.rewards`."""
 
     def __post_init__(self):
-        for field in dataclasses.fields(self):  # a range comes as a list from a configuration file
-            if isinstance(getattr(self, field.name), list):
-                setattr(self, field.name, tuple(getattr(self, field.name)))
+        for name, value in list(vars(self).items()):
+            if isinstance(value, list):  # a configuration file gives a range as a list
+                setattr(self, name, tuple(value))
         if self.xml_file and _model_path(self.xml_file).is_file():
-            self.xml_file = str(_model_path(self.xml_file).resolve())  # also from another folder
+            # An absolute path stays valid when a run is loaded from another working directory.
+            self.xml_file = str(_model_path(self.xml_file).resolve())
         if isinstance(self.shaping, dict):
             unknown = self.shaping.keys() - {field.name for field in dataclasses.fields(Shaping)}
             if unknown:
                 raise UserError(f"unknown key 'env.shaping.{min(unknown)}'")
             self.shaping = Shaping(**self.shaping)
 
+    def changed(self) -> dict[str, Any]:
+        """Options that differ from their defaults."""
+        defaults = vars(type(self)())
+        return {name: value for name, value in vars(self).items() if value != defaults[name]}
 
-class Task(abc.ABC):
+
+class Task(TrainableTask, abc.ABC):
     """A Gymnasium MuJoCo environment as pure functions of `State`.
 
-    Subclasses say what is observed and what is rewarded; nothing in them knows about engines.
+    Subclasses define observations, rewards and terminations. They do not depend on the engine.
     """
 
     GYMNASIUM_NAME: str
-    """As registered, without the version."""
+    """Name in Gymnasium's registry, without the version."""
     XML_FILES: dict[str, str]
-    """The model of each version, in Gymnasium's assets."""
+    """Model file of each version, among Gymnasium's assets."""
     REWARD_TERMS: dict[str, tuple[str, ...]]
     """Signed reward terms of each version, under the names of Gymnasium's `info`."""
     V5_ONLY: tuple[str, ...] = ("xml_file", "frame_skip")
-    """Keywords that Gymnasium's v4 class does not take."""
+    """Env options that Gymnasium's v4 class does not take."""
     HAS_Y: bool = True
-    """Whether `qpos[1]` is a way to the side."""
+    """Whether `qpos[1]` is the lateral coordinate y."""
 
     def __init__(self, options: TaskOptions, physics: str = "auto"):
         """
         Args:
-            options: Gymnasium's keywords.
-            physics: engine name, or `auto`.
+            options: env options.
+            physics: name of the engine, or `auto`.
 
         Raises:
-            UserError: an unknown version or engine, a keyword that v4 does not take, or a model file or a reward
-                function that is not there or does not work.
+            UserError: an unknown version or engine, an option that v4 does not take, shaping that has no effect, or a
+                model file or reward function that is missing or invalid.
         """
         if options.version not in self.XML_FILES:
             raise UserError(f"unknown version '{options.version}' of {options.name}; choose one of: v5, v4")
-        defaults = type(options)()
-        changed = [name for name in self.V5_ONLY if getattr(options, name) != getattr(defaults, name)]
-        if options.version == "v4" and changed:
-            raise UserError(f"{options.name} v4 does not take {', '.join(changed)}; use version=v5")
+        changed = options.changed()
+        not_in_v4 = [name for name in self.V5_ONLY if name in changed]
+        if options.version == "v4" and not_in_v4:
+            raise UserError(f"{options.name} v4 does not take {', '.join(not_in_v4)}; use version=v5")
         self.options = options
+        self.max_episode_steps = options.max_episode_steps
         self.model = load_model(options.xml_file or self.XML_FILES[options.version])
         self.dt = self.model.opt.timestep * options.frame_skip
         self.engine = make_engine(resolve_engine(physics), self.model, options.frame_skip, self.derived_names())
@@ -118,75 +160,94 @@ class Task(abc.ABC):
         self.init_qpos = jnp.asarray(self.model.qpos0, jnp.float32)
         self.init_qvel = jnp.zeros(self.model.nv, jnp.float32)
         self.observation_size = sum(self.observation_blocks().values())
-        if options.shaping.keep_y and not self.HAS_Y:
-            raise UserError(f"env.shaping.keep_y={options.shaping.keep_y}: {options.name} has no y")
-        if options.shaping.falling and not getattr(options, "terminate_when_unhealthy", False):
-            raise UserError(f"env.shaping.falling={options.shaping.falling}: no fall ends an episode here")
+        self._check_shaping()
         self._reward_function = load_reward_function(options.reward_function) if options.reward_function else None
-        self.reward_terms = self._reward_terms()
+        self.reward_terms = self._reward_term_names()
         self.metric_names = (*self.reward_terms, "nonfinite", "overflow")
+
+    def _check_shaping(self) -> None:
+        name, shaping = self.options.name, self.options.shaping
+        if shaping.keep_y and not self.HAS_Y:
+            raise UserError(f"env.shaping.keep_y={shaping.keep_y}: {name} has no y coordinate; set it to 0")
+        if shaping.falling and not self.terminates_on_fall:
+            raise UserError(f"env.shaping.falling={shaping.falling}: no fall terminates this {name}; set it to 0")
 
     @property
     def gymnasium_id(self) -> str:
-        """The environment in the real Gymnasium that this one equals."""
+        """Id of the equivalent environment in Gymnasium."""
         return f"{self.GYMNASIUM_NAME}-{self.options.version}"
 
     def gymnasium_kwargs(self) -> dict[str, Any]:
-        """Keywords for `gymnasium.make` that give the same task; those at their default are left out."""
-        defaults = type(self.options)()
-        not_theirs = {"name", "version", "max_episode_steps", "shaping", "reward_function"}
-        return {
-            field.name: getattr(self.options, field.name)
-            for field in dataclasses.fields(self.options)
-            if field.name not in not_theirs and getattr(self.options, field.name) != getattr(defaults, field.name)
-        }
+        """Keyword arguments of `gymnasium.make` for the equivalent environment, without those at their default."""
+        return {name: value for name, value in self.options.changed().items() if name not in _NOT_IN_GYMNASIUM}
 
     @property
     def has_own_reward(self) -> bool:
-        """Whether it is trained on another reward than Gymnasium's."""
-        return self._reward_function is not None or any(dataclasses.asdict(self.options.shaping).values())
+        """Whether the reward differs from Gymnasium's."""
+        return self._reward_function is not None or any(vars(self.options.shaping).values())
 
-    # What a task defines.
+    # Defined by each task.
+
+    @property
+    def terminates_on_fall(self) -> bool:
+        """Whether a fall terminates the episode."""
+        return False
 
     @abc.abstractmethod
     def derived_names(self) -> tuple[str, ...]:
-        """The `mjData` arrays that `observe` and `reward_and_termination` read."""
+        """Names of the `mjData` arrays that `observe`, `carry` and `reward_and_termination` read."""
 
     @abc.abstractmethod
     def observation_blocks(self) -> dict[str, int]:
-        """The observation's parts by their `mjData` names, in order, with their sizes."""
+        """Sizes of the observation's blocks by their `mjData` names, in order."""
 
     @abc.abstractmethod
-    def observe(self, physics: PhysicsState, derived: Derived) -> jax.Array:
-        """The observation, `[observation_size] f32`."""
+    def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
+        """Observation, in Gymnasium's order and units."""
 
-    def remember(self, physics: PhysicsState, derived: Derived) -> Memory:
-        """What the next step's reward needs from this one beside the physics state."""
+    def carry(self, physics: PhysicsState, derived: Derived) -> Carry:
+        """Quantities that the next step's reward needs, in addition to the physics state."""
         return {}
 
     @abc.abstractmethod
     def reward_and_termination(
-        self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array
-    ) -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
-        """Signed reward terms of a step, their sum as Gymnasium adds them up, and whether the episode ends."""
+        self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
+    ) -> tuple[Terms, Float[Array, ""], Bool[Array, ""]]:
+        """Gymnasium's reward terms, reward and termination of one step.
 
-    # What all tasks are.
+        Args:
+            before: state before the step.
+            physics: physics state after the step.
+            derived: the arrays of `derived_names`, after the step.
+            carry: the task's carry after the step.
+            action: in Gymnasium's units.
 
-    def reset(self, key: jax.Array) -> State:
-        """A random start. Source: `reset_model` of each Gymnasium class: uniform noise around the model's pose."""
+        Returns:
+            Signed reward terms; the reward, their sum as Gymnasium computes it; and whether the task terminates.
+        """
+
+    # Shared by all tasks.
+
+    def reset(self, key: PRNGKeyArray) -> State:
+        """Random initial state. Source: `reset_model` of the Gymnasium classes, uniform noise on the model's pose."""
         qpos_key, qvel_key = jax.random.split(key)
         scale = self.options.reset_noise_scale
         qpos_noise = jax.random.uniform(qpos_key, self.init_qpos.shape, minval=-scale, maxval=scale)
         qvel_noise = jax.random.uniform(qvel_key, self.init_qvel.shape, minval=-scale, maxval=scale)
         return self.reset_to(self.init_qpos + qpos_noise, self.init_qvel + qvel_noise)
 
-    def reset_to(self, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array | None = None) -> State:
-        """A given start. Source: Gymnasium's `set_state` after a reset.
+    def reset_to(
+        self,
+        qpos: Float[Array | np.ndarray, " nq"],
+        qvel: Float[Array | np.ndarray, " nv"],
+        warmstart: Float[Array | np.ndarray, " nv"] | None = None,
+    ) -> State:
+        """Initial state at a given position and velocity. Source: Gymnasium's `set_state` after a reset.
 
         Args:
-            qpos: `[nq]`, m and rad. Quaternions are kept and observed as given, not normalised.
-            qvel: `[nv]`, m/s and rad/s.
-            warmstart: `[nv]`, the constraint solver's starting point (`qacc_warmstart`); zero by default.
+            qpos: m and rad. Quaternions are stored and observed as given, not normalized.
+            qvel: m/s and rad/s.
+            warmstart: initial guess of the constraint solver (`qacc_warmstart`), m/s² and rad/s². Default: zeros.
         """
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
         warmstart = jnp.zeros_like(qvel) if warmstart is None else jnp.asarray(warmstart, jnp.float32)
@@ -194,7 +255,7 @@ class Task(abc.ABC):
         derived = self.engine.forward(physics)
         return State(
             physics=physics,
-            memory=self.remember(physics, derived),
+            memory=self.carry(physics, derived),
             obs=self.observe(physics, derived),
             reward=jnp.zeros((), jnp.float32),
             terminated=jnp.zeros((), bool),
@@ -203,8 +264,51 @@ class Task(abc.ABC):
             metrics={name: jnp.zeros((), jnp.float32) for name in self.metric_names},
         )
 
-    def _own_reward(self, step: RewardStep) -> tuple[Terms, jax.Array]:
-        """All reward terms and the reward, with what the options add to Gymnasium's or put in its place."""
+    def step(self, state: State, action: Float[Array, " action_size"]) -> State:
+        """Advance by one environment step, which is `frame_skip` physics steps.
+
+        Args:
+            state: returned by `reset`, `reset_to` or `step`. As in Gymnasium, a finished episode may be continued.
+            action: in Gymnasium's units. The motors clip it; the control cost uses the unclipped action.
+
+        Returns:
+            The next state. If the physics are not finite or exceed `MAX_ABS_VALUE`, the episode ends: `terminated` and
+            `metrics["nonfinite"]` are set, the reward is zero, and the physics state and observation stay unchanged.
+        """
+        action = jnp.asarray(action, jnp.float32)
+        physics, derived, overflow = self.engine.step(state.physics, action)
+        carry = self.carry(physics, derived)
+        obs = self.observe(physics, derived)
+        terms, reward, terminated = self.reward_and_termination(state, physics, derived, carry, action)
+        terms, reward = self._customize_reward(
+            RewardStep(terms, reward, state.physics, physics, obs, action, terminated, self.dt)
+        )
+
+        is_finite = _is_finite((physics.qpos, physics.qvel)) & _is_finite(
+            (physics.qacc_warmstart, obs, reward), jnp.inf
+        )
+        physics, carry, obs = jax.tree.map(
+            lambda new, old: jnp.where(is_finite, new, old),
+            (physics, carry, obs),
+            (state.physics, state.memory, state.obs),
+        )
+        # A float32 zero: weakly typed metrics would compile every program twice.
+        zero = jnp.float32(0.0)
+        terms = {name: jnp.where(is_finite, value, zero) for name, value in terms.items()}
+        steps = state.steps + 1
+        return State(
+            physics=physics,
+            memory=carry,
+            obs=obs,
+            reward=jnp.where(is_finite, reward, zero),
+            terminated=terminated | ~is_finite,
+            truncated=steps >= self.max_episode_steps,
+            steps=steps,
+            metrics=terms | {"nonfinite": jnp.float32(~is_finite), "overflow": jnp.float32(overflow)},
+        )
+
+    def _customize_reward(self, step: RewardStep) -> tuple[Terms, Float[Array, ""]]:
+        """Reward terms and reward after `reward_function` and `shaping` are applied."""
         terms, reward = step.terms, step.reward
         if self._reward_function:
             terms = {name: jnp.float32(term) for name, term in self._reward_function(step).items()}
@@ -212,7 +316,8 @@ class Task(abc.ABC):
         added = shaping_terms(self.options.shaping, step)
         return terms | added, sum(added.values(), reward)
 
-    def _reward_terms(self) -> tuple[str, ...]:
+    def _reward_term_names(self) -> tuple[str, ...]:
+        """Names of all reward terms, found by tracing `reward_function` on an example step."""
         terms = dict.fromkeys(self.REWARD_TERMS[self.options.version], jnp.float32(0.0))
         physics = PhysicsState(self.init_qpos, self.init_qvel, self.init_qvel)
         obs, action = jnp.zeros(self.observation_size), jnp.zeros(self.action_size)
@@ -222,55 +327,14 @@ class Task(abc.ABC):
             names = term_names(self._reward_function, str(self.options.reward_function), step, shaped)
         return (*names, *shaped)
 
-    def step(self, state: State, action: jax.Array) -> State:
-        """One environment step of `frame_skip` physics steps.
 
-        Args:
-            state: from `reset`, `reset_to` or `step`; a state that has ended may be stepped on, as in Gymnasium.
-            action: `[action_size] f32`, in Gymnasium's units. The motors clip it; its cost is charged unclipped.
-
-        Returns:
-            The next state. Broken physics (not finite, or beyond `MAX_ABS_VALUE`) ends the episode instead: the
-            state before it is kept, the reward is zero, `terminated` and `metrics["nonfinite"]` are set.
-        """
-        action = jnp.asarray(action, jnp.float32)
-        physics, derived, overflow = self.engine.step(state.physics, action)
-        memory = self.remember(physics, derived)
-        obs = self.observe(physics, derived)
-        terms, reward, terminated = self.reward_and_termination(state, physics, derived, memory, action)
-        rewarded = RewardStep(terms, reward, state.physics, physics, obs, action, terminated, self.dt)
-        terms, reward = self._own_reward(rewarded)
-
-        is_finite = _is_finite((physics.qpos, physics.qvel)) & _is_finite(
-            (physics.qacc_warmstart, obs, reward), jnp.inf
-        )
-        physics, memory, obs = jax.tree.map(
-            lambda new, old: jnp.where(is_finite, new, old),
-            (physics, memory, obs),
-            (state.physics, state.memory, state.obs),
-        )
-        # A strong zero: weakly typed metrics would have every program compiled twice.
-        zero = jnp.float32(0.0)
-        terms = {name: jnp.where(is_finite, value, zero) for name, value in terms.items()}
-        steps = state.steps + 1
-        return State(
-            physics=physics,
-            memory=memory,
-            obs=obs,
-            reward=jnp.where(is_finite, reward, zero),
-            terminated=terminated | ~is_finite,
-            truncated=steps >= self.options.max_episode_steps,
-            steps=steps,
-            metrics=terms | {"nonfinite": jnp.float32(~is_finite), "overflow": jnp.float32(overflow)},
-        )
-
-
-def _is_finite(arrays, limit: float = MAX_ABS_VALUE) -> jax.Array:
+def _is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[Array, ""]:
+    """Whether all elements are below `limit` in absolute value; NaN never is."""
     return jnp.array([jnp.all(jnp.abs(x) < limit) for x in arrays]).all()
 
 
 def _model_path(xml_file: str) -> Path:
-    """By the rules of Gymnasium's `xml_file`: a bare name is one of its assets, else it is a path."""
+    """Path of a model by the rules of Gymnasium's `xml_file`: a bare name is an asset of Gymnasium."""
     path = Path(xml_file).expanduser()
     if len(path.parts) == 1 and not path.exists():
         return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / xml_file
@@ -278,10 +342,13 @@ def _model_path(xml_file: str) -> Path:
 
 
 def load_model(xml_file: str) -> mujoco.MjModel:
-    """Load a model, one of Gymnasium's or one's own.
+    """Load a MuJoCo model.
+
+    Args:
+        xml_file: name of one of Gymnasium's assets, or a path.
 
     Raises:
-        UserError: there is no such file, or MuJoCo cannot read it.
+        UserError: the file does not exist, or MuJoCo cannot read it.
     """
     path = _model_path(xml_file)
     if not path.is_file():

@@ -1,21 +1,23 @@
-"""Walker2d: run forward in a plane."""
+"""Walker2d: run forward on two legs, in a plane."""
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
 
 from mjx_walk.envs.physics import Derived, PhysicsState
-from mjx_walk.envs.task import Memory, State, Task, TaskOptions
+from mjx_walk.envs.rewards import Terms
+from mjx_walk.envs.task import Carry, State, Task, TaskOptions
 from mjx_walk.utils.settings import setting
 
 MAX_OBSERVED_VELOCITY = 10.0
-"""Velocities are clipped to it in the observation, m/s and rad/s."""
+"""Limit to which observed velocities are clipped, m/s and rad/s."""
 
 
 @dataclasses.dataclass
 class Walker2dOptions(TaskOptions):
-    """Keywords of Gymnasium's `Walker2dEnv`."""
+    """Keyword arguments of Gymnasium's `Walker2dEnv`."""
 
     name: str = setting("walker2d", choices=("walker2d",))
     frame_skip: int = setting(4, at_least=1)
@@ -29,7 +31,10 @@ class Walker2dOptions(TaskOptions):
 
 
 class Walker2d(Task):
-    """Source: `gymnasium/envs/mujoco/walker2d_v5.py` and `walker2d_v4.py`. v4's right foot has friction 0.9."""
+    """Walker2d, which runs forward and must not fall.
+
+    Source: `gymnasium/envs/mujoco/walker2d_v5.py` and `walker2d_v4.py`. In v4's model the right foot has friction 0.9.
+    """
 
     GYMNASIUM_NAME = "Walker2d"
     XML_FILES = {"v5": "walker2d_v5.xml", "v4": "walker2d.xml"}
@@ -38,6 +43,10 @@ class Walker2d(Task):
 
     options: Walker2dOptions
 
+    @property
+    def terminates_on_fall(self) -> bool:
+        return self.options.terminate_when_unhealthy
+
     def derived_names(self) -> tuple[str, ...]:
         return ()
 
@@ -45,24 +54,24 @@ class Walker2d(Task):
         skipped = int(self.options.exclude_current_positions_from_observation)
         return {"qpos": self.model.nq - skipped, "qvel": self.model.nv}
 
-    def observe(self, physics: PhysicsState, derived: Derived) -> jax.Array:
-        """`[17]`: height, torso angle and six joint angles, then nine velocities, clipped."""
+    def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
+        """Observation `[17]`: height, torso angle, six joint angles, and nine clipped velocities."""
         qpos = physics.qpos[1:] if self.options.exclude_current_positions_from_observation else physics.qpos
         qvel = jnp.clip(physics.qvel, -MAX_OBSERVED_VELOCITY, MAX_OBSERVED_VELOCITY)
         return jnp.concatenate([qpos, qvel])
 
     def reward_and_termination(
-        self, before: State, physics: PhysicsState, derived: Derived, memory: Memory, action: jax.Array
-    ):
+        self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
+    ) -> tuple[Terms, Float[Array, ""], Bool[Array, ""]]:
         options = self.options
         height, angle = physics.qpos[1], physics.qpos[2]
         is_healthy = (options.healthy_z_range[0] < height) & (height < options.healthy_z_range[1])
         is_healthy &= (options.healthy_angle_range[0] < angle) & (angle < options.healthy_angle_range[1])
-        # v4 pays the healthy reward on the step that ends the episode, too.
+        # v4 also pays the healthy reward in the step that terminates the episode.
         is_paid = is_healthy | (options.terminate_when_unhealthy and options.version == "v4")
         terms = {
             "reward_forward": options.forward_reward_weight * (physics.qpos[0] - before.physics.qpos[0]) / self.dt,
             "reward_ctrl": -options.ctrl_cost_weight * jnp.square(action).sum(),
             "reward_survive": options.healthy_reward * is_paid,
         }
-        return terms, sum(terms.values()), ~is_healthy & options.terminate_when_unhealthy
+        return terms, sum(terms.values(), jnp.float32(0.0)), ~is_healthy & options.terminate_when_unhealthy

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 from brax.envs.base import Env
 from brax.envs.base import State as BraxState
 
-from mjx_walk.envs import State, TaskOptions
+from mjx_walk.envs import State, TaskOptions, TrainableTask
 from mjx_walk.envs.physics import PhysicsState
 
 
-class ToyTask:
+class ToyTask(TrainableTask):
     """What the trainer reads of a `Task`, for one action in `[-1, 1]`; the whole state is `qpos` and `qvel`."""
 
     action_size = 1
@@ -20,6 +20,7 @@ class ToyTask:
 
     def __init__(self, max_episode_steps: int = 10):
         self.options = TaskOptions(name="toy", max_episode_steps=max_episode_steps)
+        self.max_episode_steps = max_episode_steps
 
     def start(self, key):
         """`(qpos, qvel)`."""

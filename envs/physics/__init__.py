@@ -1,4 +1,8 @@
-"""Three engines behind one interface: `warp` and `jax` (MJX), and `c` (MuJoCo's C library)."""
+"""Three physics engines with one interface: `warp` and `jax` (MJX), and `c` (MuJoCo's C library).
+
+Simulation of a MuJoCo model, the choice of an engine and patches of MJX belong here.
+Observations, rewards and episodes do not.
+"""
 
 import importlib.util
 
@@ -14,14 +18,14 @@ __all__ = ["ENGINES", "Derived", "Engine", "PhysicsState", "make_engine", "resol
 
 
 def resolve_engine(name: str) -> str:
-    """The engine that `name` stands for on JAX's default device.
+    """Name of the engine to use on JAX's default device.
 
     Args:
-        name: an engine, or `auto`: `warp` on an NVIDIA GPU where Warp is installed, `jax` on any other
-            accelerator, `c` on a CPU.
+        name: name of an engine, or `auto`: `c` on a CPU, `warp` on an NVIDIA GPU if Warp is installed, `jax` on any
+            other accelerator.
 
     Raises:
-        UserError: the name is unknown, Warp is not installed, or `c` is asked for on an accelerator.
+        UserError: an unknown name, `warp` without Warp installed, or `c` on an accelerator.
     """
     device = jax.config.jax_default_device or jax.devices()[0]  # type: ignore[attr-defined]
     platform = device.platform
@@ -41,13 +45,15 @@ def resolve_engine(name: str) -> str:
 
 
 def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Engine:
-    """Build an engine. Engines are imported only when asked for, so that Warp stays optional.
+    """Create an engine.
+
+    It imports the engine's module only now, so that Warp stays an optional dependency.
 
     Args:
-        name: what `resolve_engine` returned.
-        model: Gymnasium's model, unchanged.
-        num_substeps: physics steps an environment step (Gymnasium's `frame_skip`).
-        derived: the `mjData` arrays that the task reads.
+        name: name of the engine, as `resolve_engine` returns it.
+        model: the MuJoCo model as loaded.
+        num_substeps: physics steps per environment step (Gymnasium's `frame_skip`).
+        derived: names of the `mjData` arrays that the task reads.
     """
     if name == "c":
         from mjx_walk.envs.physics.mujoco_c import CEngine

@@ -1,4 +1,4 @@
-"""The small interface between a task and an engine: state and control in, state and derived arrays out."""
+"""The interface between tasks and engines: physics state and control in, physics state and derived arrays out."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
@@ -6,47 +6,49 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import mujoco
+from jax import Array
 from jax.custom_batching import custom_vmap
+from jaxtyping import Bool, Float
 
-Derived = dict[str, jax.Array]
-"""MuJoCo arrays by their `mjData` names, as they stand after the call, for example `cinert` `[nbody, 10] f32`."""
+Derived = dict[str, Array]
+"""MuJoCo arrays by their `mjData` names, for example `cinert`, `[nbody, 10] f32`."""
 
 
 class PhysicsState(NamedTuple):
-    """All that MuJoCo needs to continue: position, velocity and the solver's starting point."""
+    """The complete state of a MuJoCo simulation: position, velocity and initial guess of the constraint solver."""
 
-    qpos: jax.Array
-    """`[nq] f32`, m and rad, quaternions as given (not normalised)."""
-    qvel: jax.Array
+    qpos: Array
+    """`[nq] f32`, m and rad. Quaternions need not be normalized."""
+    qvel: Array
     """`[nv] f32`, m/s and rad/s."""
-    qacc_warmstart: jax.Array
+    qacc_warmstart: Array
     """`[nv] f32`, m/s² and rad/s²."""
 
 
 class Engine(Protocol):
-    """A stateless physics engine, built for one model, one number of substeps and the derived arrays a task names.
+    """A physics engine for one model, one number of substeps and one list of derived arrays.
 
-    Both methods are pure, take one unbatched copy and may be nested in `jit`, `vmap` and `scan`.
+    Both methods are pure functions of one unbatched environment and support `jit`, `vmap` and `scan`.
     """
 
     name: str
     calls_host: bool
-    """It steps by a callback to the host. JAX keeps no program with one in its compile cache."""
+    """Whether it steps in a host callback. JAX does not cache compiled programs that contain one."""
 
     def forward(self, state: PhysicsState) -> Derived:
-        """Derived arrays of a state just set, at zero control. Source: Gymnasium's `set_state` (`mj_forward`)."""
+        """Derived arrays of a new state at zero control. Source: Gymnasium's `set_state` (`mj_forward`)."""
         ...
 
-    def step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Derived, jax.Array]:
-        """Advance by the engine's number of substeps under a constant control.
+    def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> tuple[PhysicsState, Derived, Bool[Array, ""]]:
+        """Advance by the engine's number of substeps at a constant control.
 
         Args:
-            state: physics state of one copy.
-            ctrl: `[nu] f32`, in the actuators' units, not clipped.
+            state: physics state of one environment.
+            ctrl: in the actuators' units, not clipped.
 
         Returns:
-            The next state; the derived arrays, which for RK4 are those of the last substep's fourth stage; and
-            `[] bool`, whether a contact or constraint buffer overflowed on the way.
+            The next state; its derived arrays, with RK4 those of the last substep's fourth stage; and whether a contact
+            or constraint buffer overflowed.
         """
         ...
 
@@ -56,14 +58,14 @@ EngineFactory = Callable[[mujoco.MjModel, int, tuple[str, ...]], Engine]
 
 
 def batch_once(batch_fn: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a function of a whole batch the face of an unbatched one.
+    """Turn a batched function into an unbatched one that is called once per batch under `vmap`.
 
     Args:
-        batch_fn: takes and returns pytrees whose leaves are `[N, …]`; called with `N = 1` where nothing is vmapped.
+        batch_fn: takes and returns pytrees whose leaves are `[N, …]`. Without `vmap`, N is 1.
 
     Returns:
-        The function of one copy. However many `vmap`s surround it, `batch_fn` is called once, with all copies in
-        one axis, so that an engine can size its buffers from `N`.
+        A function of one environment. Nested `vmap`s call `batch_fn` once, with all environments on one axis, so that
+        an engine can size its buffers by N.
     """
 
     @custom_vmap
@@ -92,7 +94,9 @@ def batch_once(batch_fn: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _broadcast(axis_size: int, in_batched, args):
-    def widen(x, is_batched):
-        return x if is_batched else jnp.broadcast_to(x, (axis_size, *jnp.shape(x)))
-
-    return jax.tree.map(widen, args, tuple(in_batched))
+    """Arguments with the batch axis added where `vmap` did not map it."""
+    return jax.tree.map(
+        lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (axis_size, *jnp.shape(x))),
+        args,
+        tuple(in_batched),
+    )

@@ -1,11 +1,12 @@
-"""MJX's contact frames of capsules on a plane, put right: the first tangent follows the capsule, as in C.
+"""A patch of MJX's contact frames between capsules and planes: the first tangent follows the capsule, as in C.
 
-MJX 3.17 takes a default tangent where the capsule stands within 30° of the plane's normal, because it tests the axis'
-length after projecting it. With a pyramidal cone the tangent decides how friction is shared out.
+MJX 3.17 uses a default tangent when the capsule is within 30° of the plane's normal. It tests the length of the axis
+after the projection onto the plane. With a pyramidal friction cone, the tangent affects the friction forces.
 """
 
-import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Int
 from mujoco.mjx._src import collision_driver, collision_primitive
 from mujoco.mjx._src.collision_types import Collision
 from mujoco.mjx._src.types import Data, GeomType, Model
@@ -13,19 +14,19 @@ from mujoco.mjx._src.types import Data, GeomType, Model
 _MIN_NORM = 1e-15
 
 
-def plane_capsule(model: Model, data: Data, key: object, geom: jax.Array) -> Collision:
-    """MJX's collision function for planes and capsules, with C's frames.
+def plane_capsule(model: Model, data: Data, key: object, geom: Int[Array, "N 2"]) -> Collision:
+    """Contacts between planes and capsules, with the frames of MuJoCo's C library.
 
     Source: `mjraw_PlaneCapsule` and `mju_makeFrame` of MuJoCo.
 
     Args:
-        model: the model.
-        data: with the geoms' poses.
+        model: the MJX model.
+        data: the MJX data, with the geoms' poses.
         key: unused.
-        geom: `[N, 2] i32`, plane and capsule of each pair.
+        geom: indices of the plane and the capsule of each pair.
 
     Returns:
-        Distances `[2N]`, positions `[2N, 3]` and frames `[2N, 3, 3]` of the capsules' two ends.
+        Distances `[2N]`, positions `[2N, 3]` and frames `[2N, 3, 3]`, one contact for each end of a capsule.
     """
     dist, pos, _ = collision_primitive.plane_capsule(model, data, key, geom)
     normal, axis = data.geom_xmat[geom[:, 0]][:, :, 2], data.geom_xmat[geom[:, 1]][:, :, 2]
@@ -41,5 +42,5 @@ plane_capsule.ncon = 2  # type: ignore[attr-defined]
 
 
 def install() -> None:
-    """Have MJX call it."""
+    """Register `plane_capsule` with MJX."""
     collision_driver._COLLISION_FUNC[GeomType.PLANE, GeomType.CAPSULE] = plane_capsule

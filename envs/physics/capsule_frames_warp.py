@@ -1,7 +1,7 @@
-"""The same for MuJoCo Warp as `capsule_frames_jax` for MJX, which says why."""
+"""The patch of `capsule_frames_jax` for MuJoCo Warp."""
 
 # mypy: ignore-errors
-# Warp compiles the function's source, in a language of its own that looks like Python.
+# Warp compiles the source of the function; its types are not Python's.
 
 import warp as wp
 from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive
@@ -18,11 +18,12 @@ def plane_capsule(
     capsule_radius: float,
     capsule_half_length: float,
 ) -> tuple[wp.vec2, mat23f, wp.mat33]:
+    """Contacts between a plane and a capsule, with the frames of MuJoCo's C library."""
     dist, pos, frame = upstream_plane_capsule(
         plane_normal, plane_pos, capsule_pos, capsule_axis, capsule_radius, capsule_half_length
     )
     tangent = wp.normalize(capsule_axis - plane_normal * wp.dot(plane_normal, capsule_axis))
-    if wp.length_sq(tangent) < 0.5:  # a capsule along the normal has no such direction
+    if wp.length_sq(tangent) < 0.5:  # the capsule is parallel to the normal
         tangent = wp.vec3(1.0, 0.0, 0.0)
     n = plane_normal
     c = wp.cross(n, tangent)
@@ -31,5 +32,5 @@ def plane_capsule(
 
 
 def install() -> None:
-    """Have Warp's collision kernels call it; before they are built."""
+    """Replace Warp's `plane_capsule`. Call it before Warp builds the collision kernels."""
     collision_primitive.plane_capsule = plane_capsule

@@ -1,8 +1,12 @@
-"""The `jax` engine: MJX's own JAX implementation, on any device that JAX knows."""
+"""The `jax` engine: MJX's JAX implementation, on any JAX device."""
+
+import functools
 
 import jax
 import jax.numpy as jnp
 import mujoco
+from jax import Array
+from jaxtyping import Bool, Float
 from mujoco import mjx
 from mujoco.mjx._src import forward as mjx_forward
 from mujoco.mjx._src import scan as mjx_scan
@@ -17,14 +21,14 @@ _RK4_WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 
 
 class JaxEngine:
-    """MJX in float32. The networks' matmul precision does not reach it: its products are always full float32."""
+    """MJX in float32. It multiplies matrices at full precision, independent of the networks' matmul precision."""
 
     name = "jax"
     calls_host = False
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
         if model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
-            raise ValueError("the jax engine integrates with RK4 only; set integrator='RK4' in the model")
+            raise ValueError("the jax engine supports the RK4 integrator only; set integrator='RK4' in the model")
         capsule_frames_jax.install()
         model = with_newton_solver(model)
         self._model = mjx.put_model(model, impl="jax")
@@ -36,12 +40,12 @@ class JaxEngine:
         return self._blank.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
 
     def forward(self, state: PhysicsState) -> Derived:
-        """Derived arrays of a state just set, at zero control; `cfrc_ext` is zero, as `mj_forward` leaves it."""
+        """See `Engine.forward`. As after `mj_forward`, `cfrc_ext` is zero."""
         with jax.default_matmul_precision("highest"):
             return read_derived(mjx.forward(self._model, self._data(state)), self._derived)
 
-    def step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Derived, jax.Array]:
-        """Advance by `num_substeps`; see `Engine.step`. Nothing overflows: every possible contact has its place."""
+    def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> tuple[PhysicsState, Derived, Bool[Array, ""]]:
+        """See `Engine.step`. No buffer overflows: MJX allocates every possible contact."""
         with jax.default_matmul_precision("highest"):
             data = self._data(state).replace(ctrl=ctrl)
             data, _ = jax.lax.scan(lambda d, _: (_runge_kutta_4(self._model, d), None), data, length=self._num_substeps)
@@ -52,27 +56,16 @@ class JaxEngine:
 
 
 def _runge_kutta_4(model: mjx.Model, start: mjx.Data) -> mjx.Data:
-    """One substep, all four stages through a single traced `forward`.
+    """Advance by one substep, with a single traced `forward` for all four stages.
 
-    Source: MuJoCo's `mj_RungeKutta`. `mjx.step` traces `forward` four times; one trace halves the compile time.
+    Source: MuJoCo's `mj_RungeKutta`. `mjx.step` compiles `forward` four times; once halves the compile time.
     """
     dt = model.opt.timestep
-
-    def move(velocity):
-        return mjx_scan.flat(
-            model,
-            lambda *args: mjx_forward._integrate_pos(*args, dt=dt),
-            "jqv",
-            "q",
-            model.jnt_type,
-            start.qpos,
-            velocity,
-        )
 
     def stage(carry, coefficients):
         data, velocity, velocity_sum, acceleration_sum = carry
         step, weight = coefficients
-        qpos = jnp.where(step == 0, start.qpos, move(step * velocity))
+        qpos = jnp.where(step == 0, start.qpos, _integrate_position(model, start.qpos, step * velocity))
         velocity = start.qvel + step * data.qacc * dt
         data = mjx.forward(model, data.replace(qpos=qpos, qvel=velocity))
         return (data, velocity, velocity_sum + weight * velocity, acceleration_sum + weight * data.qacc), None
@@ -81,5 +74,16 @@ def _runge_kutta_4(model: mjx.Model, start: mjx.Data) -> mjx.Data:
     table = (jnp.array(_RK4_STEP, dt.dtype), jnp.array(_RK4_WEIGHT, dt.dtype))
     (data, _, velocity, acceleration), _ = jax.lax.scan(stage, (start, zeros, zeros, zeros), table)
     return data.replace(
-        qpos=move(velocity), qvel=start.qvel + dt * acceleration, qacc_warmstart=data.qacc, time=start.time + dt
+        qpos=_integrate_position(model, start.qpos, velocity),
+        qvel=start.qvel + dt * acceleration,
+        qacc_warmstart=data.qacc,
+        time=start.time + dt,
     )
+
+
+def _integrate_position(
+    model: mjx.Model, qpos: Float[Array, " nq"], velocity: Float[Array, " nv"]
+) -> Float[Array, " nq"]:
+    """Position after one substep at a constant velocity. Source: MuJoCo's `mj_integratePos`."""
+    integrate = functools.partial(mjx_forward._integrate_pos, dt=model.opt.timestep)
+    return mjx_scan.flat(model, integrate, "jqv", "q", model.jnt_type, qpos, velocity)

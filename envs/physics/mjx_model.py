@@ -1,4 +1,4 @@
-"""What the two MJX engines share: the model they take, and the arrays they hand back."""
+"""Functions of both MJX engines: preparing the model and reading derived arrays."""
 
 import copy
 
@@ -8,14 +8,14 @@ from mujoco import mjx
 from mjx_walk.envs.physics.base import Derived
 
 MIN_SOLVER_ITERATIONS = 8
-"""Newton's iterations and line-search steps. In float32, 4 are exact only while few contacts act; 8 equal 50."""
+"""Newton iterations and line-search steps. In float32, 8 give the same result as 50; 4 do only with few contacts."""
 
 
 def with_newton_solver(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy of `model` solved by Newton's method, converged.
+    """Copy of a model that uses the Newton solver, with enough iterations to converge.
 
-    Deviation: Gymnasium's humanoids use PGS, which MJX does not have. The constraint problem is convex and has one
-    solution; converged, the two solvers agree to 1e-6.
+    Deviation: Gymnasium's humanoids use PGS, which MJX does not implement. The constraint problem is convex and has one
+    solution. After convergence, the two solvers agree to 1e-6.
     """
     model = copy.deepcopy(model)
     model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
@@ -25,5 +25,5 @@ def with_newton_solver(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def read_derived(data: mjx.Data, names: tuple[str, ...]) -> Derived:
-    """The named arrays; MJX keeps some of them in the part of its data that belongs to the implementation."""
+    """Derived arrays by name. MJX stores some of them in `_impl`, its implementation-specific data."""
     return {name: getattr(data, name) if hasattr(data, name) else getattr(data._impl, name) for name in names}

@@ -1,5 +1,6 @@
-"""The `warp` engine: MJX on MuJoCo Warp, for NVIDIA GPUs (and, slowly, for CPU tests)."""
+"""The `warp` engine: MJX on MuJoCo Warp, for NVIDIA GPUs. It also runs on a CPU, slowly, for tests."""
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -7,6 +8,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import warp as wp
+from jax import Array
+from jaxtyping import Bool, Float
 from mujoco import mjx
 
 from mjx_walk.envs.physics import capsule_frames_warp
@@ -14,30 +17,30 @@ from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
 
 CONTACTS_PER_ENV = 40
-"""Room for geom pairs that may touch, and then for contacts, of a copy on average; the batch shares both buffers.
+"""Mean capacity per environment for candidate geom pairs, and for contacts. The batch shares both buffers.
 
-Measured, highest mean over a batch: 20.7 pairs and 10.0 contacts (HumanoidStandup on the floor under random actions),
-7.3 contacts under trained policies."""
+The highest means over a batch were 20.7 pairs and 10.0 contacts under random actions (HumanoidStandup on the floor),
+and 7.3 contacts under trained policies."""
 SPARE_CONTACTS = 256
-"""Room on top, so that a small batch, whose mean swings further, does not overflow."""
+"""Additional capacity for the batch, since the mean of a small batch varies more."""
 CONSTRAINTS_PER_ENV = 112
-"""Constraint rows of any one copy: four for a contact with friction, one for any other and for a joint limit.
+"""Capacity of each environment for constraint rows. A contact takes four with friction, else one; a joint limit one.
 
-Measured: at most 49 under random actions, 31 under trained policies."""
+The highest counts were 49 under random actions and 31 under trained policies."""
 
 
 class WarpEngine:
-    """MuJoCo Warp in float32, called once a substep for the whole batch."""
+    """MuJoCo Warp in float32, called once per substep for the entire batch."""
 
     name = "warp"
     calls_host = False
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
         capsule_frames_warp.install()
-        # Without a GPU, Warp would warn that it has found none.
+        # On a CPU, this hides Warp's warning about a missing GPU.
         wp.config.log_level = wp.LOG_ERROR if jax.default_backend() == "cpu" else wp.LOG_WARNING
         self._mj_model = with_newton_solver(model)
-        # Warp would print two lines an overflow; it is returned instead, and counted in the metrics.
+        # `step` returns overflows, so Warp need not print them.
         self._model = mjx.put_model(self._mj_model, impl="warp", device=jax.local_devices()[0]).tree_replace(
             {"opt._impl.warn_overflow": 0}
         )
@@ -51,7 +54,10 @@ class WarpEngine:
         self.step = batch_once(self._step)
 
     def _data(self, state: PhysicsState) -> mjx.Data:
-        """Warp's work space for the whole batch, made inside the program: nearly all zeros, never a constant."""
+        """Warp's data for the entire batch.
+
+        Most arrays are zeros. The program allocates them itself instead of holding them as constants.
+        """
         num_envs = state.qpos.shape[0]
         with jax.ensure_compile_time_eval():
             blank = mjx.make_data(
@@ -68,26 +74,28 @@ class WarpEngine:
     def _forward(self, state: PhysicsState) -> Derived:
         return read_derived(self._mjx_forward(self._data(state)), self._derived)
 
-    def _step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Derived, jax.Array]:
+    def _step(self, state: PhysicsState, ctrl: Float[Array, "B nu"]) -> tuple[PhysicsState, Derived, Bool[Array, " B"]]:
         data = self._data(state).replace(ctrl=ctrl)
         overflow = lost_rows = jnp.zeros(ctrl.shape[0], bool)
         for substep in range(self._num_substeps):
             is_last = substep == self._num_substeps - 1
             data = self._last_mjx_step(data) if is_last else self._mjx_step(data)
-            # The buffer is shared: once it is full, any copy may have lost a contact.
-            # Pairs that do not fit are dropped before they become contacts, and `nacon` never shows it.
-            most = jnp.maximum(data._impl.nacon, data._impl.ncollision)
-            overflow |= (most > data._impl.naconmax).any()
+            # All environments share the buffers, so any of them may have lost a contact.
+            # `nacon` does not count the pairs that Warp drops before it computes contacts.
+            num_needed = jnp.maximum(data._impl.nacon, data._impl.ncollision)
+            overflow |= (num_needed > data._impl.naconmax).any()
             lost_rows |= data._impl.nefc > data._impl.njmax
-        # Warp's solver does not survive lost rows: velocities explode. Such a copy is broken, and is marked as broken.
+        # Velocities diverge once constraint rows are lost, so the task must end these episodes as not finite.
         qpos = jnp.where(lost_rows[:, None], jnp.nan, data.qpos)
         state = PhysicsState(qpos, data.qvel, data.qacc_warmstart)
         return state, read_derived(data, self._derived), overflow | lost_rows
 
 
-_OnData = Callable[[mjx.Data], mjx.Data]
+def _over_batch(
+    function: Callable[[mjx.Model, mjx.Data], mjx.Data], model: mjx.Model
+) -> Callable[[mjx.Data], mjx.Data]:
+    """Batch a function of MJX data.
 
-
-def _over_batch(function: Callable[[mjx.Model, mjx.Data], mjx.Data], model: mjx.Model) -> _OnData:
-    """For a whole batch, and traced once: anew for each substep it would take a third of a chunk's tracing."""
-    return jax.jit(jax.vmap(lambda data: function(model, data)), inline=True)
+    `jit` caches its trace. Tracing it in every substep would take a third of the tracing time of a training call.
+    """
+    return jax.jit(jax.vmap(functools.partial(function, model)), inline=True)

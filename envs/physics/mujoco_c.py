@@ -1,23 +1,30 @@
-"""The `c` engine: MuJoCo's C library, called back from the jitted program. Fast on a CPU, and the oracle."""
+"""The `c` engine: MuJoCo's C library in a host callback. It is fast on a CPU, and the reference for the others."""
 
+import functools
+import itertools
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import mujoco
 import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float
 
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 
-_BAD_STATE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{array}")) for array in ("QPOS", "QVEL", "QACC")]
-_MIN_COPIES_PER_TASK = 8
-"""Below this a thread's start costs more than it saves."""
+_WARNING = mujoco.mjtWarning
+_BAD_STATE = [int(_WARNING.mjWARN_BADQPOS), int(_WARNING.mjWARN_BADQVEL), int(_WARNING.mjWARN_BADQACC)]
+_MIN_ENVS_PER_THREAD = 8
+"""With fewer environments, starting a thread takes longer than it saves."""
+_Shape = jax.ShapeDtypeStruct
 
 
 class CEngine:
-    """MuJoCo in float64 with the model's own solver: Gymnasium's physics to float32 rounding of the state.
+    """MuJoCo in float64 with the model's own solver. It equals Gymnasium's physics up to float32 rounding of the state.
 
-    The copies are shared out over one thread a core; MuJoCo releases Python's lock while it steps.
+    One thread per core steps a share of the environments. MuJoCo releases the GIL while it steps.
     """
 
     name = "c"
@@ -26,9 +33,8 @@ class CEngine:
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
         self._model = model
         self._num_substeps = num_substeps
-        self._derived = derived
         blank = mujoco.MjData(model)
-        self._shapes = {name: np.shape(getattr(blank, name)) for name in derived}
+        self._derived_shapes = {name: np.shape(getattr(blank, name)) for name in derived}
         self._num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._workspaces = [mujoco.MjData(model) for _ in range(self._num_threads)]
         self._pool = ThreadPoolExecutor(self._num_threads, thread_name_prefix="mujoco")
@@ -36,72 +42,81 @@ class CEngine:
         self.step = batch_once(self._step)
 
     def _forward(self, state: PhysicsState) -> Derived:
-        result = self._result_shapes(len(state.qpos))[1]
-        return jax.pure_callback(self._host_forward, result, *state)
+        _, derived, _ = self._result_shapes(len(state.qpos))
+        return jax.pure_callback(self._host_forward, derived, *state)
 
-    def _step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, Derived, jax.Array]:
-        result = self._result_shapes(len(ctrl))
-        next_state, derived, overflow = jax.pure_callback(self._host_step, result, *state, ctrl)
+    def _step(self, state: PhysicsState, ctrl: Float[Array, "B nu"]) -> tuple[PhysicsState, Derived, Bool[Array, " B"]]:
+        shapes = self._result_shapes(len(ctrl))
+        next_state, derived, overflow = jax.pure_callback(self._host_step, shapes, *state, ctrl)
         return PhysicsState(*next_state), derived, overflow
 
-    def _result_shapes(self, num_envs: int):
-        def array(*shape, dtype=np.float32):
-            return jax.ShapeDtypeStruct((num_envs, *shape), dtype)
+    def _result_shapes(self, num_envs: int) -> tuple[tuple[_Shape, ...], dict[str, _Shape], _Shape]:
+        """Shapes of what `_step` returns."""
+        float32 = functools.partial(jax.ShapeDtypeStruct, dtype=np.float32)
+        nq, nv = self._model.nq, self._model.nv
+        state = (float32((num_envs, nq)), float32((num_envs, nv)), float32((num_envs, nv)))
+        derived = {name: float32((num_envs, *shape)) for name, shape in self._derived_shapes.items()}
+        return state, derived, jax.ShapeDtypeStruct((num_envs,), np.bool_)
 
-        state = (array(self._model.nq), array(self._model.nv), array(self._model.nv))
-        return state, {name: array(*shape) for name, shape in self._shapes.items()}, array(dtype=np.bool_)
-
-    def _host_forward(self, qpos, qvel, warmstart) -> dict[str, np.ndarray]:
-        qpos, qvel, warmstart = (np.asarray(x, np.float64) for x in (qpos, qvel, warmstart))
-        derived = self._empty_derived(len(qpos))
-
-        def one(data: mujoco.MjData, i: int) -> None:
-            mujoco.mj_resetData(self._model, data)  # clears cfrc_ext, which mj_forward leaves alone
-            data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos[i], qvel[i], warmstart[i]
-            mujoco.mj_forward(self._model, data)
-            self._store(data, derived, i)
-
-        self._for_each_copy(len(qpos), one)
+    def _host_forward(self, *arrays: np.ndarray) -> dict[str, np.ndarray]:
+        state = [np.asarray(x, np.float64) for x in arrays]
+        derived = self._empty_derived(len(state[0]))
+        self._for_each_env(len(state[0]), functools.partial(self._forward_one, state, derived))
         return derived
 
-    def _host_step(self, qpos, qvel, warmstart, ctrl):
-        qpos, qvel, warmstart, ctrl = (np.asarray(x, np.float64) for x in (qpos, qvel, warmstart, ctrl))
-        state = tuple(np.empty(x.shape, np.float32) for x in (qpos, qvel, warmstart))
-        derived = self._empty_derived(len(qpos))
+    def _forward_one(
+        self, state: list[np.ndarray], derived: dict[str, np.ndarray], data: mujoco.MjData, i: int
+    ) -> None:
+        mujoco.mj_resetData(self._model, data)  # clears cfrc_ext, which mj_forward does not compute
+        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = (x[i] for x in state)
+        mujoco.mj_forward(self._model, data)
+        self._store_derived(derived, data, i)
 
-        def one(data: mujoco.MjData, i: int) -> None:
-            data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos[i], qvel[i], warmstart[i]
-            data.ctrl[:] = ctrl[i]
-            mujoco.mj_step(self._model, data, nstep=self._num_substeps)
-            mujoco.mj_rnePostConstraint(self._model, data)
-            for target, source in zip(state, (data.qpos, data.qvel, data.qacc_warmstart), strict=True):
-                target[i] = source
-            self._store(data, derived, i)
-            if data.warning.number[_BAD_STATE].any():
-                # MuJoCo met a bad state, reset itself and went on. Say so as the MJX engines do.
-                for target in state:
-                    target[i] = np.nan
-                mujoco.mj_resetData(self._model, data)
+    def _host_step(self, *arrays: np.ndarray) -> tuple[tuple[np.ndarray, ...], dict[str, np.ndarray], np.ndarray]:
+        *state, ctrl = (np.asarray(x, np.float64) for x in arrays)
+        next_state = tuple(np.empty(x.shape, np.float32) for x in state)
+        derived = self._empty_derived(len(ctrl))
+        self._for_each_env(len(ctrl), functools.partial(self._step_one, state, ctrl, next_state, derived))
+        return next_state, derived, np.zeros(len(ctrl), np.bool_)
 
-        self._for_each_copy(len(qpos), one)
-        return state, derived, np.zeros(len(qpos), np.bool_)
+    def _step_one(
+        self,
+        state: list[np.ndarray],
+        ctrl: np.ndarray,
+        next_state: tuple[np.ndarray, ...],
+        derived: dict[str, np.ndarray],
+        data: mujoco.MjData,
+        i: int,
+    ) -> None:
+        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = (x[i] for x in state)
+        data.ctrl[:] = ctrl[i]
+        mujoco.mj_step(self._model, data, nstep=self._num_substeps)
+        mujoco.mj_rnePostConstraint(self._model, data)
+        for target, source in zip(next_state, (data.qpos, data.qvel, data.qacc_warmstart), strict=True):
+            target[i] = source
+        self._store_derived(derived, data, i)
+        if data.warning.number[_BAD_STATE].any():
+            # MuJoCo has detected an invalid state and has reset itself. The MJX engines return NaN instead.
+            for target in next_state:
+                target[i] = np.nan
+            mujoco.mj_resetData(self._model, data)
 
     def _empty_derived(self, num_envs: int) -> dict[str, np.ndarray]:
-        return {name: np.empty((num_envs, *shape), np.float32) for name, shape in self._shapes.items()}
+        return {name: np.empty((num_envs, *shape), np.float32) for name, shape in self._derived_shapes.items()}
 
-    def _store(self, data: mujoco.MjData, derived: dict[str, np.ndarray], i: int) -> None:
-        for name, target in derived.items():
-            target[i] = getattr(data, name)
+    def _store_derived(self, derived: dict[str, np.ndarray], data: mujoco.MjData, i: int) -> None:
+        for name, array in derived.items():
+            array[i] = getattr(data, name)
 
-    def _for_each_copy(self, num_envs: int, one) -> None:
-        num_tasks = max(1, min(self._num_threads, num_envs // _MIN_COPIES_PER_TASK))
-        bounds = np.linspace(0, num_envs, num_tasks + 1).astype(int)
+    def _for_each_env(self, num_envs: int, function: Callable[[mujoco.MjData, int], None]) -> None:
+        """Call `function(data, i)` for every environment i, in several threads if there are enough environments."""
+        num_threads = max(1, min(self._num_threads, num_envs // _MIN_ENVS_PER_THREAD))
+        bounds = np.linspace(0, num_envs, num_threads + 1).astype(int)
+        ranges = [range(start, stop) for start, stop in itertools.pairwise(bounds)]
+        run = functools.partial(_for_range, function)
+        list((map if num_threads == 1 else self._pool.map)(run, self._workspaces, ranges))
 
-        def run(task: int) -> None:
-            for i in range(bounds[task], bounds[task + 1]):
-                one(self._workspaces[task], i)
 
-        if num_tasks == 1:
-            run(0)
-        else:
-            list(self._pool.map(run, range(num_tasks)))
+def _for_range(function: Callable[[mujoco.MjData, int], None], data: mujoco.MjData, indices: range) -> None:
+    for i in indices:
+        function(data, i)

@@ -11,7 +11,7 @@ from brax.training.agents.sac import networks as sac_networks
 from brax.training.agents.sac import train as sac
 
 from mjx_walk.algos.sac import SACConfig, make_sac
-from mjx_walk.envs import State, TaskOptions
+from mjx_walk.envs import State, TaskOptions, TrainableTask
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.training.trainer import make_chunk, make_init
@@ -20,12 +20,13 @@ _UNROLL_LENGTH = 10
 _EPISODE_LENGTH = 1000
 
 
-class BraxTask:
+class BraxTask(TrainableTask):
     """An environment of Brax's behind the face of a `Task`, so that our trainer and Brax's meet on the same one."""
 
     def __init__(self, env: brax.envs.Env):
         self.env = env
         self.options = TaskOptions(name="brax", max_episode_steps=_EPISODE_LENGTH)
+        self.max_episode_steps = _EPISODE_LENGTH
         self.observation_size, self.action_size = env.observation_size, env.action_size
         self.action_low, self.action_high = -jnp.ones(env.action_size), jnp.ones(env.action_size)
         self.reward_terms: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""On the `c` engine the environments equal the real Gymnasium to float32 rounding."""
+"""On the `c` engine, the environments equal Gymnasium's up to float32 rounding."""
 
 import gymnasium
 import jax
@@ -18,21 +18,21 @@ def real_env(task, **kwargs):
 
 
 def assert_equal_step(task, state, real, action):
-    """Step both, from one float32 state, and compare all that Gymnasium returns."""
+    """Step both environments from the same float32 state and compare everything that Gymnasium returns."""
     obs, reward, terminated, _, info = real.step(action)
     state = task.jitted(state, action)
     np.testing.assert_array_equal(state.obs, np.float32(obs))
-    # Velocities divide the rounding of a position by dt.
+    # A velocity is a difference of rounded positions, divided by dt.
     position_rounding = 2 * np.spacing(np.float32(np.abs(real.data.qpos[:2]).max() + 1)) / task.dt
     np.testing.assert_allclose(state.reward, reward, rtol=3e-6, atol=1.25 * position_rounding)
     assert bool(state.terminated) == bool(terminated)
-    for name in () if task.gymnasium_id == "Walker2d-v4" else task.reward_terms:  # whose info has none of them
+    for name in () if task.gymnasium_id == "Walker2d-v4" else task.reward_terms:  # its info has no terms
         np.testing.assert_allclose(state.metrics[name], info[name], rtol=3e-6, atol=1.25 * position_rounding)
     return state
 
 
-def synchronised(task, state, real):
-    """The task's state at exactly the real environment's, which is rounded to float32 first."""
+def synchronized(task, state, real):
+    """The task's state set to the real environment's, after rounding both to float32."""
     arrays = (real.data.qpos, real.data.qvel, real.data.qacc_warmstart)
     rounded = [np.float32(x) for x in arrays]
     for target, value in zip(arrays, rounded, strict=True):
@@ -44,7 +44,7 @@ def synchronised(task, state, real):
 
 
 @pytest.mark.parametrize(("name", "version"), VERSIONS)
-def test_every_step_of_a_long_trajectory(name, version):
+def test_every_step_of_an_episode(name, version):
     task = make_env(name, physics="c", version=version)
     task.jitted = jax.jit(task.step)
     real = real_env(task)
@@ -52,8 +52,10 @@ def test_every_step_of_a_long_trajectory(name, version):
     state = task.reset_to(np.float32(real.data.qpos), np.float32(real.data.qvel))
     rng = np.random.default_rng(0)
     for _ in range(1000):
-        action = np.float32(rng.uniform(-1.5, 1.5, task.action_size) * task.action_high)  # beyond the motors' range
-        state = assert_equal_step(task, synchronised(task, state, real), real, action)
+        action = np.float32(
+            rng.uniform(-1.5, 1.5, task.action_size) * task.action_high
+        )  # partly outside the motors' range
+        state = assert_equal_step(task, synchronized(task, state, real), real, action)
 
 
 @pytest.mark.parametrize(("name", "version"), VERSIONS)
@@ -72,7 +74,7 @@ def test_reset_observation(name, version):
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_resets_are_drawn_as_in_gymnasium(name):
+def test_reset_noise_has_gymnasiums_distribution(name):
     task = make_env(name, physics="c")
     keys = jax.random.split(jax.random.PRNGKey(0), 400)
     ours = jax.vmap(task.reset)(keys).physics
@@ -84,7 +86,7 @@ def test_resets_are_drawn_as_in_gymnasium(name):
     assert len(np.unique(np.asarray(ours.qpos), axis=0)) == 400
 
 
-KEYWORDS = {
+OPTIONS = {
     "humanoid": {
         "forward_reward_weight": 2.0,
         "ctrl_cost_weight": 0.3,
@@ -124,21 +126,21 @@ KEYWORDS = {
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", TASKS)
-def test_keywords_mean_what_they_mean_in_gymnasium(name):
-    task = make_env(name, physics="c", **KEYWORDS[name])
-    # frame_skip changes dt, which Gymnasium holds against its render_fps only after building the class.
-    real = real_env(task, **KEYWORDS[name])
-    assert task.gymnasium_kwargs().keys() == KEYWORDS[name].keys()
+def test_options_have_the_same_effect_as_in_gymnasium(name):
+    task = make_env(name, physics="c", **OPTIONS[name])
+    # Gymnasium compares dt, which depends on frame_skip, with render_fps only after it has built the class.
+    real = real_env(task, **OPTIONS[name])
+    assert task.gymnasium_kwargs().keys() == OPTIONS[name].keys()
     real.reset(seed=1)
     state = task.reset_to(np.float32(real.data.qpos), np.float32(real.data.qvel))
     rng = np.random.default_rng(1)
     task.jitted = jax.jit(task.step)
     for _ in range(60):
         action = np.float32(rng.uniform(-1, 1, task.action_size) * task.action_high)
-        state = assert_equal_step(task, synchronised(task, state, real), real, action)
+        state = assert_equal_step(task, synchronized(task, state, real), real, action)
 
 
-def test_time_limit_truncates_and_does_not_terminate():
+def test_time_limit_truncates_without_terminating():
     task = make_env("humanoid_standup", physics="c", max_episode_steps=3)
     state = task.reset(jax.random.PRNGKey(0))
     seen = []

@@ -1,4 +1,4 @@
-"""Rewards beyond Gymnasium's: each added term from its definition, and a function of one's own."""
+"""Reward shaping, term by term against its definition, and custom reward functions."""
 
 import json
 
@@ -12,7 +12,7 @@ from mjx_walk.envs import make_env
 from mjx_walk.envs.rewards import Shaping
 from mjx_walk.utils.errors import UserError
 
-OWN_REWARD = """
+CUSTOM_REWARD = """
 import jax.numpy as jnp
 
 def upright(step):
@@ -34,14 +34,14 @@ def vector(step):
 
 
 @pytest.fixture
-def own(tmp_path):
+def custom(tmp_path):
     path = tmp_path / "my_reward.py"
-    path.write_text(OWN_REWARD)
+    path.write_text(CUSTOM_REWARD)
     return path
 
 
 def step(task, qpos_change, qvel, action=0.3):
-    """One step from the model's pose, changed, and the same of Gymnasium's task alone."""
+    """The states before and after one step from the model's pose with some positions changed."""
     qpos = task.init_qpos + jnp.zeros_like(task.init_qpos).at[jnp.array(list(qpos_change))].set(
         jnp.array(list(qpos_change.values()))
     )
@@ -49,7 +49,7 @@ def step(task, qpos_change, qvel, action=0.3):
     return before, jax.jit(task.step)(before, jnp.full(task.action_size, action))
 
 
-def test_each_term_follows_from_its_definition():
+def test_shaping_terms_equal_their_definitions():
     weights = {"keep_y": 2.0, "shaking": 0.5, "falling": 7.0, "backward": 3.0}
     plain = make_env("humanoid", physics="c")
     shaped = make_env("humanoid", physics="c", shaping=Shaping(**weights))
@@ -75,19 +75,19 @@ def test_each_term_follows_from_its_definition():
     assert fell == 1
 
 
-def test_a_weight_of_zero_leaves_gymnasiums_reward_as_it_is():
+def test_zero_weights_add_no_terms():
     assert make_env("walker2d", physics="c").reward_terms == ("reward_forward", "reward_ctrl", "reward_survive")
 
 
-def test_own_reward_takes_the_place_of_gymnasiums(own):
-    task = make_env("walker2d", physics="c", reward_function=f"{own}:upright", shaping=Shaping(shaking=0.1))
+def test_custom_reward_replaces_gymnasiums(custom):
+    task = make_env("walker2d", physics="c", reward_function=f"{custom}:upright", shaping=Shaping(shaking=0.1))
     assert set(task.reward_terms) == {"reward_height", "reward_forward", "reward_shaking"}
     _, after = step(task, {1: 0.2}, 0.3)
     assert float(after.metrics["reward_height"]) == pytest.approx(2.0 * float(after.physics.qpos[1]), rel=1e-6)
     assert float(after.reward) == pytest.approx(sum(float(after.metrics[name]) for name in task.reward_terms), rel=1e-5)
 
 
-def test_training_with_an_own_reward_is_scored_by_gymnasium(own, tmp_path, monkeypatch):
+def test_policy_trained_on_a_custom_reward_is_scored_by_gymnasium(custom, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = api.run(
         [
@@ -102,7 +102,7 @@ def test_training_with_an_own_reward_is_scored_by_gymnasium(own, tmp_path, monke
         row["episode/reward_height"] + row["episode/reward_forward"] + row["episode/reward_falling"], rel=1e-4
     )
     assert json.loads((tmp_path / "run" / "eval_gymnasium.json").read_text())["env"] == "Walker2d-v5"
-    own.unlink()  # neither the policy nor its score needs it
+    custom.unlink()  # loading and scoring the policy do not need it
     assert api.load_run("run").evaluate(1).env == "Walker2d-v5"
 
 
@@ -114,11 +114,11 @@ def test_training_with_an_own_reward_is_scored_by_gymnasium(own, tmp_path, monke
         ("my_reward.py:missing", "has no function 'missing'"),
         ("my_reward.py:broken", "NameError: name 'missing' is not defined"),
         ("my_reward.py:vector", "must return a dict of scalars by name"),
-        ("my_reward.py:length", "the term's name 'length' does not begin with reward_"),
-        ("my_reward.py:falling", "the term's name 'reward_falling' is one of env.shaping's"),
+        ("my_reward.py:length", "the term's name 'length' must begin with reward_"),
+        ("my_reward.py:falling", "env.shaping already has the term 'reward_falling'"),
     ],
 )
-def test_a_reward_function_that_does_not_work(own, tmp_path, monkeypatch, function, says):
+def test_invalid_reward_function_is_refused(custom, tmp_path, monkeypatch, function, says):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError) as error:
         make_env("walker2d", physics="c", reward_function=function, shaping={"falling": 1.0})
@@ -128,11 +128,11 @@ def test_a_reward_function_that_does_not_work(own, tmp_path, monkeypatch, functi
 @pytest.mark.parametrize(
     ("name", "shaping", "says"),
     [
-        ("walker2d", {"keep_y": 1.0}, "walker2d has no y"),
-        ("humanoid_standup", {"falling": 1.0}, "no fall ends an episode here"),
+        ("walker2d", {"keep_y": 1.0}, "walker2d has no y coordinate; set it to 0"),
+        ("humanoid_standup", {"falling": 1.0}, "no fall terminates this humanoid_standup; set it to 0"),
         ("walker2d", {"faling": 1.0}, "unknown key 'env.shaping.faling'"),
     ],
 )
-def test_shaping_that_would_do_nothing(name, shaping, says):
+def test_shaping_without_effect_is_refused(name, shaping, says):
     with pytest.raises(UserError, match=says):
         make_env(name, physics="c", shaping=shaping)

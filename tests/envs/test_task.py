@@ -1,19 +1,22 @@
-"""Purity, vmap, and the guard against broken physics."""
+"""The contract of a task: purity, vmap, the finiteness check, shapes, and errors for invalid options."""
 
 from pathlib import Path
 
 import gymnasium
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
+from shapes import check_shapes
+from toy_tasks import MountainCar
 
-from mjx_walk.envs import TASKS, make_env
+from mjx_walk.envs import TASKS, TrainableTask, make_env
 from mjx_walk.envs.physics import base
 from mjx_walk.utils.errors import UserError
 
 
-def test_vmap_equals_one_by_one():
+def test_vmap_equals_separate_steps():
     task = make_env("walker2d", physics="c")
     states = jax.vmap(task.reset)(jax.random.split(jax.random.PRNGKey(0), 20))
     actions = jax.random.uniform(jax.random.PRNGKey(1), (20, 6), minval=-1, maxval=1)
@@ -23,7 +26,14 @@ def test_vmap_equals_one_by_one():
         jax.tree.map(np.testing.assert_array_equal, alone, jax.tree.map(lambda x, i=i: x[i], together))
 
 
-def test_nested_vmap_calls_the_engine_once():
+@pytest.mark.parametrize("make", [lambda: make_env("walker2d", physics="c"), MountainCar])
+def test_tasks_have_the_attributes_that_trainers_need(make):
+    task = make()
+    assert all(hasattr(task, name) for name in TrainableTask.__annotations__)
+    np.testing.assert_array_equal(task.scale_action(2.0 * task.action_high), task.action_high)
+
+
+def test_nested_vmap_calls_a_batched_function_once():
     sizes = []
 
     def batch(x):
@@ -35,7 +45,7 @@ def test_nested_vmap_calls_the_engine_once():
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_broken_physics_ends_the_episode_and_reaches_nobody(name):
+def test_nonfinite_physics_terminates_and_is_not_returned(name):
     task = make_env(name, physics="c")
     good = task.reset(jax.random.PRNGKey(0))
     broken = good.replace(physics=good.physics._replace(qvel=good.physics.qvel.at[0].set(jnp.nan)))
@@ -43,12 +53,12 @@ def test_broken_physics_ends_the_episode_and_reaches_nobody(name):
     assert bool(after.terminated) and after.metrics["nonfinite"] == 1
     np.testing.assert_array_equal(after.obs, good.obs)
     assert after.reward == 0 and all(np.isfinite(value) for value in after.metrics.values())
-    sound = task.step(good, jnp.zeros(task.action_size))
-    assert sound.metrics["nonfinite"] == 0 and not bool(sound.terminated)
+    finite = task.step(good, jnp.zeros(task.action_size))
+    assert finite.metrics["nonfinite"] == 0 and not bool(finite.terminated)
 
 
-def test_velocities_beyond_mujocos_limit_are_broken():
-    """Of 1e10, where MuJoCo itself begins an episode anew."""
+def test_velocities_beyond_mujocos_limit_count_as_nonfinite():
+    """Beyond 1e10, MuJoCo resets its simulation."""
     task = make_env("walker2d", physics="c")
     state, step = task.reset(jax.random.PRNGKey(0)), task.engine.step
     for excess, is_broken in ((0.9e10, False), (1.1e10, True)):
@@ -63,17 +73,40 @@ def _faster(stepped, excess):
     return physics._replace(qvel=physics.qvel.at[-1].add(excess)), *rest
 
 
-def test_an_action_that_is_not_a_number_is_caught():
+def test_nan_actions_count_as_nonfinite():
     task = make_env("humanoid", physics="c")
     state = task.reset(jax.random.PRNGKey(0))
     after = task.step(state, jnp.full(17, jnp.nan))
     assert after.metrics["nonfinite"] == 1 and np.isfinite(after.obs).all() and np.isfinite(after.reward)
 
 
-def test_state_is_lean():
+def test_state_holds_no_derived_arrays():
     task = make_env("humanoid", physics="c")
     state = task.reset(jax.random.PRNGKey(0))
     assert sum(x.size for x in jax.tree.leaves(state)) < task.observation_size + 100
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_shapes_equal_the_annotations(name, monkeypatch):
+    methods = ("reset", "reset_to", "step", "carry", "observe", "reward_and_termination", "scale_action")
+    check_shapes(monkeypatch, TASKS[name][0], *methods)
+    task = make_env(name, physics="c")
+    states = jax.vmap(task.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
+    actions = task.scale_action(jnp.ones((3, task.action_size)))
+    jax.vmap(task.step)(states, actions)
+    with pytest.raises(jaxtyping.TypeCheckError, match="qpos"):
+        task.reset_to(task.init_qpos.reshape(1, -1), task.init_qvel)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_actions_are_scaled_to_gymnasiums_units(name):
+    task = make_env(name, physics="c")
+    np.testing.assert_array_equal(task.scale_action(jnp.full(task.action_size, -2.0)), task.action_low)
+    np.testing.assert_array_equal(task.scale_action(jnp.ones(task.action_size)), task.action_high)
+    actions = jax.random.uniform(jax.random.PRNGKey(0), (3, 2, task.action_size), minval=-1.5, maxval=1.5)
+    center, half_range = (task.action_high + task.action_low) / 2, (task.action_high - task.action_low) / 2
+    expected = np.float32(center + half_range * np.clip(actions, -1.0, 1.0))
+    np.testing.assert_array_equal(task.scale_action(actions), expected)
 
 
 @pytest.mark.parametrize(
@@ -88,16 +121,16 @@ def test_state_is_lean():
         ({"name": "humanoid", "version": "v4", "include_cvel_in_observation": False}, "does not take include_cvel"),
     ],
 )
-def test_mistakes_are_named(kwargs, says):
+def test_invalid_options_are_refused(kwargs, says):
     with pytest.raises(UserError, match=says.replace("?", r"\?")):
         make_env(**({"name": "walker2d", "physics": "c"} | kwargs))
 
 
-def test_own_model_file(tmp_path):
+def test_custom_model_file(tmp_path):
     source = Path(gymnasium.__path__[0]) / "envs" / "mujoco" / "assets" / "walker2d_v5.xml"
     text = source.read_text().replace('timestep="0.002"', 'timestep="0.001"')
-    own = tmp_path / "own.xml"
-    own.write_text(text)
-    task = make_env("walker2d", physics="c", xml_file=str(own))
+    path = tmp_path / "custom.xml"
+    path.write_text(text)
+    task = make_env("walker2d", physics="c", xml_file=str(path))
     assert task.dt == pytest.approx(0.004)
-    assert task.gymnasium_kwargs() == {"xml_file": str(own)}
+    assert task.gymnasium_kwargs() == {"xml_file": str(path)}
