@@ -5,9 +5,9 @@ import dataclasses
 import json
 import os
 import pickle
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from subprocess import PIPE, Popen
 from typing import Any
 
 import jax
@@ -94,40 +94,35 @@ def _play_in_gymnasium(
     is_over = np.zeros(len(seeds), bool)
     shares = [share for share in np.array_split(np.arange(len(seeds)), os.cpu_count() or 1) if share.size]
     with contextlib.ExitStack() as stack:
-        workers = [stack.enter_context(_Worker()) for _ in shares]
+        # `multiprocessing` would import the user's main module a second time.
+        workers = [
+            stack.enter_context(start_module("evaluation.gymnasium_worker", stdin=PIPE, stdout=PIPE)) for _ in shares
+        ]
         for worker, share in zip(workers, shares, strict=True):
-            worker.send((task.gymnasium_id, keywords, [seeds[i] for i in share]))
-        obs = np.concatenate([worker.receive() for worker in workers])
+            _send(worker, (task.gymnasium_id, keywords, [seeds[i] for i in share]))
+        obs = np.concatenate([_receive(worker) for worker in workers])
         while not is_over.all():
             actions = np.asarray(act(obs.astype(np.float32)))
             lengths += ~is_over
             for worker, share in zip(workers, shares, strict=True):
-                worker.send(actions[share])
+                _send(worker, actions[share])
             for worker, share in zip(workers, shares, strict=True):
-                obs[share], rewards, is_over[share] = worker.receive()
+                obs[share], rewards, is_over[share] = _receive(worker)
                 returns[share] += rewards
     return returns, lengths
 
 
-class _Worker(contextlib.AbstractContextManager):
-    """A `gymnasium_worker` process; `multiprocessing` would import the user's main module a second time."""
+def _send(worker: Popen, message: Any) -> None:
+    assert worker.stdin
+    send(worker.stdin, message)
 
-    def __init__(self) -> None:
-        self._process = start_module("evaluation.gymnasium_worker", stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        assert self._process.stdin and self._process.stdout
-        self._stdin, self._stdout = self._process.stdin, self._process.stdout
 
-    def send(self, message: Any) -> None:
-        send(self._stdin, message)
-
-    def receive(self) -> Any:
-        try:
-            return pickle.load(self._stdout)
-        except EOFError:
-            raise RuntimeError("a Gymnasium process ended; its error is above") from None
-
-    def __exit__(self, *exception: Any) -> None:
-        self._process.__exit__(*exception)  # closes the pipes, at which the process ends, and waits
+def _receive(worker: Popen) -> Any:
+    assert worker.stdout
+    try:
+        return pickle.load(worker.stdout)
+    except EOFError:
+        raise RuntimeError("a Gymnasium process ended; its error is above") from None
 
 
 def score_in_sim(task: Task, policy: PolicyFn, num_episodes: int, seed: int = 0) -> Scores:

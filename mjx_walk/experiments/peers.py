@@ -21,6 +21,10 @@ from mjx_walk.training.trainer import make_chunk, make_init
 
 _UNROLL_LENGTH = 10
 _EPISODE_LENGTH = 1000
+_SAC_SIZES: dict[str, dict[str, Any]] = {
+    "gpu": {"batch_size": 512, "grad_updates_per_step": 8, "replay_capacity": 1_000_000, "learning_starts": 1_000_000},
+    "cpu": {"batch_size": 64, "grad_updates_per_step": 4, "replay_capacity": 20_000, "learning_starts": 20_000},
+}
 
 
 def measure(algo: str, hardware: str) -> Iterator[Measurement]:
@@ -36,17 +40,8 @@ def measure(algo: str, hardware: str) -> Iterator[Measurement]:
         speed = brax_ppo_speed(env, num_envs, *sizes)
         yield Measurement(f"Brax's PPO on its reduced humanoid, {num_envs} environments", speed, "env-steps/s")
         return
-    num_envs, batch_size, grad_updates, capacity, num_steps = (
-        (128, 512, 8, 1_000_000, 300) if hardware == "gpu" else (16, 64, 4, 20_000, 20)
-    )
-    config = SACConfig(
-        unroll_length=1,
-        grad_updates_per_step=grad_updates,
-        batch_size=batch_size,
-        replay_capacity=capacity,
-        learning_starts=capacity,
-        observation_clip=None,
-    )
+    num_envs, num_steps = (128, 300) if hardware == "gpu" else (16, 20)
+    config = SACConfig(unroll_length=1, observation_clip=None, **_SAC_SIZES[hardware])
     ours = sac_speed(env, num_envs, config, num_steps)
     yield Measurement("our SAC on Brax's humanoid", ours, "updates/s")
     theirs = brax_sac_speed(env, num_envs, config, num_steps)

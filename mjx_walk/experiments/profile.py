@@ -9,20 +9,21 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import gymnasium
 import jax
 import jax.numpy as jnp
+from gymnasium.utils.performance import benchmark_step
 from jax.extend import core
 
 from mjx_walk.algos import make_algorithm
 from mjx_walk.algos.off_policy import OffPolicyConfig
 from mjx_walk.common.replay_buffer import ReplayBuffer, Steps
-from mjx_walk.envs import State, Task
+from mjx_walk.envs import Task
 from mjx_walk.envs.physics import make_engine
 from mjx_walk.experiments.timing import Measurement
 from mjx_walk.runs.config import Config
 from mjx_walk.training.trainer import make_chunk, make_init
 from mjx_walk.utils.types import Algorithm, Metrics, TrainState
+from mjx_walk.viewing.episode import make_gymnasium
 
 _STEPS_PER_CALL = 25
 """About as long as a random policy keeps a humanoid upright. Every call starts from resets, like real episodes."""
@@ -36,14 +37,18 @@ def measure(config: Config, task: Task, seconds: float) -> Iterator[Measurement]
         task: its environment.
         seconds: least time to measure each speed.
     """
-    on_one_core = gymnasium_speed(task, seconds)
+    on_one_core = benchmark_step(make_gymnasium(task), seconds, seed=0)  # type: ignore[arg-type]
     yield Measurement("Gymnasium, one core", on_one_core, "env-steps/s")
-    physics = physics_speed(task, config.num_envs, seconds)
+    start = jax.jit(jax.vmap(task.reset))(jax.random.split(jax.random.PRNGKey(0), config.num_envs))
+    engine = make_engine(task.engine.name, task.model, task.options.frame_skip, ())  # without derived arrays
+    physics = _random_action_speed(task, start.physics, lambda *args: engine.step(*args)[0], seconds)
     yield Measurement("physics only", physics, "env-steps/s")
-    steps = step_speed(task, config.num_envs, seconds)
+    steps = _random_action_speed(task, start, task.step, seconds)
     yield Measurement("physics, observation and reward", steps, "env-steps/s")
     algorithm, fused = _learning_at_once(config, task), not task.engine.calls_host
-    training = training_speed(config, algorithm, fused, seconds)
+    call = make_chunk(algorithm, config.iterations_per_call, fused)
+    call_seconds = _seconds_per_call(lambda state: call(state)[0], _init(algorithm), seconds)[1]
+    training = algorithm.steps_per_iteration * config.iterations_per_call / call_seconds
     yield Measurement("training", training, "env-steps/s")
     yield Measurement("training / Gymnasium on one core", training / on_one_core, "times")
     yield from _iteration_times(config, algorithm, fused, physics, seconds)
@@ -52,12 +57,8 @@ def measure(config: Config, task: Task, seconds: float) -> Iterator[Measurement]
         yield from _insert_times(task)
 
 
-def steps_per_second(advance: Callable[[Any], Any], carry: Any, steps_per_call: int, seconds: float) -> float:
-    """Time repeated calls of `carry → carry`. The first one compiles and does not count."""
-    return steps_per_call / _seconds_per_call(advance, carry, seconds)[1]
-
-
 def _seconds_per_call(advance: Callable[[Any], Any], carry: Any, seconds: float) -> tuple[Any, float]:
+    """The carry after repeated calls of `carry → carry`, and seconds per call without the first one, which compiles."""
     carry = jax.block_until_ready(advance(carry))
     start, calls = time.monotonic(), 0
     while time.monotonic() - start < seconds:
@@ -66,50 +67,21 @@ def _seconds_per_call(advance: Callable[[Any], Any], carry: Any, seconds: float)
     return carry, (time.monotonic() - start) / calls
 
 
-def gymnasium_speed(task: Task, seconds: float) -> float:
-    """Steps per second of the real environment under random actions, resets included."""
-    env = gymnasium.make(task.gymnasium_id, **task.gymnasium_kwargs())
-    env.reset(seed=0)
-    start, steps = time.monotonic(), 0
-    while time.monotonic() - start < seconds:
-        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-        steps += 1
-        if terminated or truncated:
-            env.reset()
-    return steps / (time.monotonic() - start)
+def _random_action_speed(task: Task, start: Any, step: Callable[[Any, jax.Array], Any], seconds: float) -> float:
+    """Environment steps per second of `step`, under random actions from a batch of starts."""
+    advance = jax.jit(functools.partial(_advance, task, start, jax.vmap(step)))
+    num_steps = len(jax.tree.leaves(start)[0]) * _STEPS_PER_CALL
+    return num_steps / _seconds_per_call(advance, jax.random.PRNGKey(1), seconds)[1]
 
 
-def physics_speed(task: Task, num_envs: int, seconds: float) -> float:
-    """Environment steps per second of the engine alone, without derived arrays."""
-    engine = make_engine(task.engine.name, task.model, task.options.frame_skip, ())
-    step = jax.vmap(lambda state, action: engine.step(state, action)[0])
-    return _speed_under_random_actions(task, num_envs, seconds, _reset(task, num_envs).physics, step)
-
-
-def step_speed(task: Task, num_envs: int, seconds: float) -> float:
-    """Environment steps per second with observation, reward and termination."""
-    return _speed_under_random_actions(task, num_envs, seconds, _reset(task, num_envs), jax.vmap(task.step))
-
-
-def _reset(task: Task, num_envs: int) -> State:
-    return jax.jit(jax.vmap(task.reset))(jax.random.split(jax.random.PRNGKey(0), num_envs))
-
-
-def _speed_under_random_actions(
-    task: Task, num_envs: int, seconds: float, start: Any, step: Callable[[Any, jax.Array], Any]
-) -> float:
-    advance = jax.jit(functools.partial(_advance, task, num_envs, start, step))
-    return steps_per_second(advance, jax.random.PRNGKey(1), num_envs * _STEPS_PER_CALL, seconds)
-
-
-def _advance(task: Task, num_envs: int, start: Any, step: Callable[[Any, jax.Array], Any], key: jax.Array) -> jax.Array:
-    """Take random actions for `_STEPS_PER_CALL` steps from the start; the next key."""
+def _advance(task: Task, start: Any, step: Callable[[Any, jax.Array], Any], key: jax.Array) -> jax.Array:
+    """Take random actions for `_STEPS_PER_CALL` steps from the start, and return the next key."""
+    shape = (len(jax.tree.leaves(start)[0]), task.action_size)
 
     def one(carry, _):
         state, key = carry
         key, action_key = jax.random.split(key)
-        low, high = task.action_low, task.action_high
-        action = jax.random.uniform(action_key, (num_envs, task.action_size), minval=low, maxval=high)
+        action = jax.random.uniform(action_key, shape, minval=task.action_low, maxval=task.action_high)
         return (step(state, action), key), None
 
     (state, key), _ = jax.lax.scan(one, (start, key), length=_STEPS_PER_CALL)
@@ -117,12 +89,8 @@ def _advance(task: Task, num_envs: int, start: Any, step: Callable[[Any, jax.Arr
     return key + jnp.isnan(jnp.concatenate([x.ravel() for x in jax.tree.leaves(state)])).any().astype(key.dtype)
 
 
-def training_speed(config: Config, algorithm: Algorithm, fused: bool, seconds: float) -> float:
-    """Environment steps per second of the training loop's calls, without logging and saving."""
-    call = make_chunk(algorithm, config.iterations_per_call, fused)
-    state = make_init(algorithm)(jax.random.PRNGKey(0))
-    steps_per_call = algorithm.steps_per_iteration * config.iterations_per_call
-    return steps_per_second(lambda state: call(state)[0], state, steps_per_call, seconds)
+def _init(algorithm: Algorithm) -> TrainState:
+    return make_init(algorithm)(jax.random.PRNGKey(0))
 
 
 def _learning_at_once(config: Config, task: Task) -> Algorithm:
@@ -161,8 +129,7 @@ def time_parts(algorithm: Algorithm, iterations_per_call: int, fused: bool, seco
         seconds: least time to measure each part.
     """
     only_collect = make_chunk(algorithm._replace(learn=_read_batch), iterations_per_call, fused)
-    state = make_init(algorithm)(jax.random.PRNGKey(0))
-    state, collecting = _seconds_per_call(lambda state: only_collect(state)[0], state, seconds)
+    state, collecting = _seconds_per_call(lambda state: only_collect(state)[0], _init(algorithm), seconds)
     state, batch = jax.jit(algorithm.collect, donate_argnums=0)(state)
     learn = jax.jit(algorithm.learn, donate_argnums=0)
     _, learning = _seconds_per_call(lambda state: learn(state, batch)[0], state, seconds)
@@ -176,9 +143,8 @@ def _read_batch(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
 
 def learning_flops(algorithm: Algorithm) -> float:
     """Floating-point operations of the matrix products in one iteration."""
-    state = jax.eval_shape(make_init(algorithm), jax.random.PRNGKey(0))
-    state, batch = jax.eval_shape(algorithm.collect, state)
-    return matmul_flops(algorithm.learn, state, batch)
+    state = jax.eval_shape(algorithm.init, jax.random.PRNGKey(0))
+    return matmul_flops(algorithm.learn, *jax.eval_shape(algorithm.collect, state))
 
 
 def matmul_flops(function: Callable, *arguments: Any) -> float:
@@ -216,7 +182,7 @@ def matmul_speed(dtype: str, seconds: float) -> float:
     size = 8192 if jax.default_backend() != "cpu" else 1024
     matrix = jax.random.normal(jax.random.PRNGKey(0), (size, size), dtype)
     product = jax.jit(lambda a: jax.lax.fori_loop(0, 10, lambda _, a: (a @ matrix) / size**0.5, a))
-    return steps_per_second(product, matrix, 10 * 2 * size**3, seconds)
+    return 10 * 2 * size**3 / _seconds_per_call(product, matrix, seconds)[1]
 
 
 def _insert_times(task: Task) -> Iterator[Measurement]:

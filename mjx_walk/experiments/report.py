@@ -159,27 +159,25 @@ def _draw(groups: dict[str, list[LoggedRun]], path: Path) -> None:
 
 def _markdown(groups: dict[str, list[LoggedRun]]) -> str:
     """A table with a row per group."""
-    lines = [
-        "| variant | seeds | score in Gymnasium, mean over seeds | spread (std) | 95% interval | lowest seed "
-        "| million steps | seconds | seeds per process |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for name, runs in groups.items():
-        scores = np.array([run.scores["mean"] for run in runs if run.scores])
-        bounds = interval(scores)
-        columns = [
-            name,
-            f"{len(scores)} of {len(runs)} scored" if len(scores) < len(runs) else str(len(runs)),
-            f"{scores.mean():,.0f}" if len(scores) else "–",
-            f"{scores.std(ddof=1):,.0f}" if len(scores) > 1 else "–",
-            f"{bounds[0]:,.0f} to {bounds[1]:,.0f}" if bounds else "–",
-            f"{scores.min():,.0f}" if len(scores) else "–",
-            f"{np.mean([run.rows[-1]['env_steps'] for run in runs]) / 1e6:,.2f}",
-            f"{np.mean([run.rows[-1]['wall_seconds'] for run in runs]):,.0f}",
-            " or ".join(map(str, sorted({int(_seeds_together(run)) for run in runs}))),
-        ]
-        lines.append(f"| {' | '.join(columns)} |")
-    return "\n".join(lines) + "\n"
+    table = [_markdown_row(name, runs) for name, runs in groups.items()]
+    lines = [list(table[0]), ["---"] * len(table[0]), *(list(row.values()) for row in table)]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _markdown_row(variant: str, runs: list[LoggedRun]) -> dict[str, str]:
+    scores = np.array([run.scores["mean"] for run in runs if run.scores])
+    bounds = interval(scores)
+    return {
+        "variant": variant,
+        "seeds": f"{len(scores)} of {len(runs)} scored" if len(scores) < len(runs) else str(len(runs)),
+        "score in Gymnasium, mean over seeds": f"{scores.mean():,.0f}" if len(scores) else "–",
+        "spread (std)": f"{scores.std(ddof=1):,.0f}" if len(scores) > 1 else "–",
+        "95% interval": f"{bounds[0]:,.0f} to {bounds[1]:,.0f}" if bounds else "–",
+        "lowest seed": f"{scores.min():,.0f}" if len(scores) else "–",
+        "million steps": f"{np.mean([run.rows[-1]['env_steps'] for run in runs]) / 1e6:,.2f}",
+        "seconds": f"{np.mean([run.rows[-1]['wall_seconds'] for run in runs]):,.0f}",
+        "seeds per process": " or ".join(map(str, sorted({int(_seeds_together(run)) for run in runs}))),
+    }
 
 
 def _csv_row(variant: str, run: LoggedRun) -> dict[str, Any]:

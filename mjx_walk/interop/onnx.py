@@ -17,29 +17,15 @@ from onnx import TensorProto, helper, numpy_helper
 from mjx_walk.utils.errors import UserError
 
 _OPSET = 17
-_OPERATORS = {
-    "abs": "Abs",
-    "add": "Add",
-    "div": "Div",
+_UNARY = ("abs", "erf", "exp", "log", "neg", "not", "sign", "sqrt", "tanh")
+_BINARY = ("add", "div", "max", "min", "mul", "pow", "sub")
+_OPERATORS = {name: name.capitalize() for name in _UNARY + _BINARY} | {
     "eq": "Equal",
-    "erf": "Erf",
-    "exp": "Exp",
     "ge": "GreaterOrEqual",
     "gt": "Greater",
     "le": "LessOrEqual",
-    "log": "Log",
     "logistic": "Sigmoid",
     "lt": "Less",
-    "max": "Max",
-    "min": "Min",
-    "mul": "Mul",
-    "neg": "Neg",
-    "not": "Not",
-    "pow": "Pow",
-    "sign": "Sign",
-    "sqrt": "Sqrt",
-    "sub": "Sub",
-    "tanh": "Tanh",
 }
 """JAX's primitives with an ONNX operator of the same meaning."""
 _INLINED = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")

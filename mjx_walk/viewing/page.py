@@ -15,14 +15,8 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.episode import Episode
 
 _TEMPLATE = Path(__file__).with_name("page.html")
-_SHAPES = {
-    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
-    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
-    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
-    mujoco.mjtGeom.mjGEOM_BOX: "box",
-    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
-}
+_SHAPES = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
+"""Shapes that the page can draw."""
 _NUM_VISIBLE_GROUPS = 3
 """MuJoCo's viewer shows the geoms of the first three groups; models use the others for collisions."""
 
@@ -91,9 +85,9 @@ def _geoms(model: mujoco.MjModel) -> list[dict[str, Any]]:
     """The visible geoms, without planes, height fields and signed distance functions."""
     geoms = []
     for i in range(model.ngeom):
-        shape = _SHAPES.get(mujoco.mjtGeom(model.geom_type[i]))
+        shape = mujoco.mjtGeom(model.geom_type[i]).name.removeprefix("mjGEOM_").lower()
         rgba = model.mat_rgba[model.geom_matid[i]] if model.geom_matid[i] >= 0 else model.geom_rgba[i]
-        if shape is None or model.geom_group[i] >= _NUM_VISIBLE_GROUPS or rgba[3] == 0:
+        if shape not in _SHAPES or model.geom_group[i] >= _NUM_VISIBLE_GROUPS or rgba[3] == 0:
             continue
         geom = {
             "type": shape,

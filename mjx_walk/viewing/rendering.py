@@ -5,8 +5,9 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
-import imageio_ffmpeg
+import imageio.v3 as iio
 import numpy as np
 
 from mjx_walk.utils.errors import UserError
@@ -45,13 +46,9 @@ def write_film(frames: list[np.ndarray], path: Path, frames_per_second: float) -
         frames_per_second: of the film.
     """
     height, width = (size // 2 * 2 for size in frames[0].shape[:2])
-    writer = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=frames_per_second, quality=7, macro_block_size=2, ffmpeg_log_level="error"
-    )
+    even = [frame[:height, :width] for frame in frames]
+    options: dict[str, Any] = {"quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
     with warnings.catch_warnings():
         # Starting ffmpeg forks, and Python warns of a fork in a process with threads; JAX has some.
         warnings.simplefilter("ignore", RuntimeWarning)
-        writer.send(None)
-    for frame in frames:
-        writer.send(np.ascontiguousarray(frame[:height, :width]))
-    writer.close()
+        iio.imwrite(path, even, plugin="FFMPEG", fps=frames_per_second, **options)
