@@ -1,4 +1,4 @@
-"""`python -m mjx_walk.eval run=RUN_DIR`: score a run's policy without noise."""
+"""`python -m mjx_walk.eval run=RUN_DIR`: score the deterministic policy of a run."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ USAGE = """
 usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [episodes=100] [backend=gymnasium|sim] [seed=0] [physics=ENGINE]
 
   backend=gymnasium   the real environment, on the CPU; writes eval_gymnasium.json into the run folder
-  backend=sim         the run's own engine, or another one by physics=
+  backend=sim         the run's own engine, or the one given by physics=
 """
 
 
@@ -25,19 +25,19 @@ class Arguments:
     physics: str | None = None
 
 
-def main(arguments: list[str]) -> None:
-    """Evaluate and print."""
-    parsed = cli.parse(Arguments, arguments, USAGE)
-    if parsed.physics and parsed.backend == "gymnasium":
-        raise UserError(f"physics={parsed.physics} needs backend=sim: Gymnasium has an engine of its own")
-    folder = zoo.open_run(parsed.run)
-    run = load_run(folder.path, parsed.physics)
-    is_kept = parsed.backend == "gymnasium" and not zoo.holds(folder.path)
-    if is_kept:
+def main(command_line: list[str]) -> None:
+    """Score the policy, print the result, and save a Gymnasium score in the run folder."""
+    arguments = cli.parse(Arguments, command_line, USAGE)
+    if arguments.physics and arguments.backend == "gymnasium":
+        raise UserError(f"physics={arguments.physics} needs backend=sim: Gymnasium has its own engine")
+    folder = zoo.open_run(arguments.run)
+    run = load_run(folder.path, arguments.physics)
+    is_saved = arguments.backend == "gymnasium" and not zoo.holds(folder.path)
+    if is_saved:
         cli.check_writable(folder.gymnasium_scores)
-    scores = run.evaluate(parsed.episodes, parsed.backend, parsed.seed)
+    scores = run.evaluate(arguments.episodes, arguments.backend, arguments.seed)
     print(scores)
-    if is_kept:
+    if is_saved:
         scores.save(folder.gymnasium_scores, env_steps=run.policy_facts["env_steps"])
 
 

@@ -1,4 +1,4 @@
-"""`python -m mjx_walk.export run=RUN_DIR`: a policy as a file that needs neither JAX nor this package."""
+"""`python -m mjx_walk.export run=RUN_DIR`: export a policy to a file that runs without JAX and this package."""
 
 import dataclasses
 from pathlib import Path
@@ -12,9 +12,9 @@ from mjx_walk.utils.settings import setting
 USAGE = """
 usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [format=onnx] [out=FILE.onnx]
 
-  out=FILE.onnx   by default RUN_DIR/policy.onnx, or NAME.onnx here for a policy of the zoo. Its input `observation`,
-                  [N, observation_size] f64, and its output `action`, [N, action_size] f32, are Gymnasium's; what
-                  observations are normalised by is inside.
+  out=FILE.onnx   by default RUN_DIR/policy.onnx, or NAME.onnx in the current folder for a policy of the zoo. The model
+                  maps `observation`, [N, observation_size] f64, to `action`, [N, action_size] f32, both in Gymnasium's
+                  units. It normalises observations itself.
 """
 
 
@@ -25,21 +25,19 @@ class Arguments:
     out: str | None = None
 
 
-def main(arguments: list[str]) -> None:
+def main(command_line: list[str]) -> None:
     """Write the file."""
-    parsed = cli.parse(Arguments, arguments, USAGE)
+    arguments = cli.parse(Arguments, command_line, USAGE)
     cli.stay_on_cpu()
-    if parsed.run is None:
-        raise UserError(f"say which run: run=RUN_DIR, or {zoo.PREFIX}NAME")
+    folder = zoo.open_run(arguments.run)
     try:
         import onnx
 
         from mjx_walk.interop.onnx import translate
     except ImportError as error:
         raise UserError("format=onnx needs ONNX: pip install onnx") from error
-    folder = zoo.open_run(parsed.run)
-    run = load_run(parsed.run, "c")
-    path = Path(parsed.out) if parsed.out else zoo.output_path(folder, "policy.onnx")
+    run = load_run(folder.path, "c")
+    path = Path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.onnx")
     cli.check_writable(path)
     model = translate(run.act, run.task.observation_size, f"{run.config.env.name}_{run.config.algo.name}")
     onnx.save(model, str(path))

@@ -1,4 +1,4 @@
-"""`python -m mjx_walk.plots run=RUN_DIR`: learning curves of a run, in its folder."""
+"""`python -m mjx_walk.plots run=RUN_DIR`: draw the learning curves of a run into its folder."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from mjx_walk.viewing.curves import plot_run
 USAGE = """
 usage: python -m mjx_walk.plots run=RUN_DIR
 
-  Draws its curves again, which a run does at its end; it may still be training.
+  Draws the curves that a run draws when it ends. The run may still be training.
 """
 
 
@@ -19,10 +19,9 @@ class Arguments:
     run: str | None = None
 
 
-def main(arguments: list[str]) -> None:
-    """Draw, and say what was written."""
-    parsed = cli.parse(Arguments, arguments, USAGE)
-    folder = zoo.open_run(parsed.run)
+def main(command_line: list[str]) -> None:
+    """Draw the curves, and print the files written."""
+    folder = zoo.open_run(cli.parse(Arguments, command_line, USAGE).run)
     written = plot_run(folder)
     if not written:
         raise UserError(f"{folder.path} has no metrics to draw")

@@ -25,16 +25,16 @@ def test_bench_measures_and_writes(tmp_path, algo, tiny, sizes):
     speeds = ("Gymnasium, one core", "physics only", "physics, observation and reward", "training")
     assert all(results[name] > 100 for name in speeds)
     for part, limit in (("collecting", "physics alone"), ("learning", "matrix products alone")):
-        assert results[f"an update: {part}"] > 0 and results[f"  of which {limit} would take"] > 0
+        assert results[f"an iteration: {part}"] > 0 and results[f"  of which {limit} would take"] > 0
     inserts = [value for name, value in results.items() if name.startswith("insert of 4,096 transitions")]
     assert len(inserts) == (2 if algo == "td3" else 0) and all(value > 0 for value in inserts)
-    assert all(results[f"compile and first chunk, {name} caches"] > 0 for name in ("cold", "warm"))
+    assert all(results[f"compile and first call, {name} caches"] > 0 for name in ("cold", "warm"))
     on = [results[name] for name in results if name.startswith("training on ")]
     assert len(on) == len(sizes) and all(speed > 10 for speed in on)
     if sizes:
-        assert results["  times that on 1, of 2"] == on[1] / on[0]
+        assert results["  speedup over 1 device, of 2"] == on[1] / on[0]
     assert results["peak memory, host"] > 0.1
-    assert content["env"] == "Walker2d-v5" and content["versions"]["mujoco"] and "32 copies" in content["device"]
+    assert content["env"] == "Walker2d-v5" and content["versions"]["mujoco"] and "32 environments" in content["device"]
 
 
 def test_a_mistake_in_the_settings_costs_one_line(capsys):
@@ -49,7 +49,7 @@ def test_devices_are_doubled_up_to_those_asked_for(capsys):
 
 
 def test_a_speed_is_that_after_everything_is_compiled(monkeypatch):
-    """Chunks of 100 steps: after 40 s of compiling, 5 s more for what looks at results, then 2 s each."""
+    """Calls of 100 steps: 40 s of compiling, 5 s more for the programs that read results, then 2 s each."""
     rows = [{"env_steps": 100 * (i + 1), "wall_seconds": float(at)} for i, at in enumerate([40, 47, 49, 51, 53, 55])]
 
     def logged(arguments, are_enough, *_):

@@ -5,8 +5,8 @@ import json
 import pytest
 from helpers import command
 
-from mjx_walk import parity
 from mjx_walk.envs import TASKS
+from mjx_walk.evaluation import parity
 
 pytestmark = pytest.mark.slow
 
@@ -38,8 +38,8 @@ def test_parity_of_all_versions(name, version, physics):
 
 
 def test_parity_where_new_memory_holds_no_zeros():
-    """On a CPU, reductions over a batch of this size read memory that was never written, without `xla_flags`."""
-    sizes = ("env=humanoid_standup", "copies=48", "steps=120")
+    """On a CPU, reductions over a batch of this size read memory that was never written, without `prepare_jax`."""
+    sizes = ("env=humanoid_standup", "num_envs=48", "steps=120")
     done = command("parity", "physics=jax", *sizes, env=AS_A_USER | {"MALLOC_PERTURB_": "128"})
     assert done.returncode == 0, done.stdout
     assert "0 not finite" in done.stdout

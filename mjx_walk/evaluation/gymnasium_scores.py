@@ -1,12 +1,13 @@
-"""Score a policy: in the real Gymnasium, or in a run's own engine."""
+"""Scores of a policy: in the real Gymnasium, or in a run's own engine."""
 
+import contextlib
 import dataclasses
 import json
 import os
 import pickle
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from subprocess import PIPE, Popen
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ import numpy as np
 
 from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
+from mjx_walk.evaluation.gymnasium_worker import send
 from mjx_walk.utils.subprocesses import start_module
 from mjx_walk.utils.types import PolicyFn
 from mjx_walk.utils.versions import package_versions
@@ -21,7 +23,7 @@ from mjx_walk.utils.versions import package_versions
 
 @dataclasses.dataclass
 class Scores:
-    """Undiscounted returns and lengths of whole episodes."""
+    """Undiscounted returns and lengths of complete episodes."""
 
     returns: np.ndarray
     """`[N] f64`."""
@@ -29,6 +31,7 @@ class Scores:
     """`[N] i64`."""
     seeds: list[int]
     env: str
+    """Gymnasium's name, followed by the engine if it is not Gymnasium's."""
 
     @property
     def mean(self) -> float:
@@ -45,7 +48,7 @@ class Scores:
         )
 
     def save(self, path: Path, **facts: Any) -> None:
-        """Write all episodes with the versions that made them, and any further facts, as JSON."""
+        """Write all episodes as JSON, with the versions of the packages and any further facts."""
         content = {
             "env": self.env,
             "mean": self.mean,
@@ -61,23 +64,23 @@ class Scores:
         unfinished.replace(path)
 
 
-_MOST_SIDE_BY_SIDE = 1024
-"""Episodes that are played at once: an environment takes about 1 MB."""
+_MAX_PARALLEL_EPISODES = 1024
+"""Episodes played at once; an environment takes about 1 MB."""
 
 
 def score_in_gymnasium(task: Task, act: Callable[[np.ndarray], np.ndarray], num_episodes: int, seed: int = 0) -> Scores:
-    """Whole episodes in `gymnasium.make`: CPU MuJoCo, float64, the model's own solver.
+    """Score complete episodes in `gymnasium.make`: MuJoCo on the CPU, in float64, with the model's own solver.
 
-    The episodes run side by side, shared out over one process a core.
+    One process per core plays the episodes.
 
     Args:
-        task: says which environment, with which keywords.
+        task: the environment and its keywords.
         act: `[N, observation_size] f32 → [N, action_size] f32`, both in Gymnasium's units.
         num_episodes: N.
         seed: episode i is reset with `seed + i`.
     """
     seeds = [seed + i for i in range(num_episodes)]
-    rounds = [seeds[i : i + _MOST_SIDE_BY_SIDE] for i in range(0, num_episodes, _MOST_SIDE_BY_SIDE)]
+    rounds = [seeds[i : i + _MAX_PARALLEL_EPISODES] for i in range(0, num_episodes, _MAX_PARALLEL_EPISODES)]
     returns, lengths = zip(*(_play_in_gymnasium(task, act, some) for some in rounds), strict=True)
     return Scores(np.concatenate(returns), np.concatenate(lengths), seeds, task.gymnasium_id)
 
@@ -85,57 +88,45 @@ def score_in_gymnasium(task: Task, act: Callable[[np.ndarray], np.ndarray], num_
 def _play_in_gymnasium(
     task: Task, act: Callable[[np.ndarray], np.ndarray], seeds: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns and lengths of the episodes that begin with these seeds, side by side."""
+    """Play one episode per seed, all in parallel; their returns and lengths."""
     keywords = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
     returns, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), np.int64)
     is_over = np.zeros(len(seeds), bool)
     shares = [share for share in np.array_split(np.arange(len(seeds)), os.cpu_count() or 1) if share.size]
-    workers = [_Worker() for _ in shares]
-    try:
+    with contextlib.ExitStack() as stack:
+        # `multiprocessing` would import the user's main module a second time.
+        workers = [
+            stack.enter_context(start_module("evaluation.gymnasium_worker", stdin=PIPE, stdout=PIPE)) for _ in shares
+        ]
         for worker, share in zip(workers, shares, strict=True):
-            worker.send((task.gymnasium_id, keywords, [seeds[i] for i in share]))
-        obs = np.concatenate([worker.receive() for worker in workers])
+            _send(worker, (task.gymnasium_id, keywords, [seeds[i] for i in share]))
+        obs = np.concatenate([_receive(worker) for worker in workers])
         while not is_over.all():
             actions = np.asarray(act(obs.astype(np.float32)))
             lengths += ~is_over
             for worker, share in zip(workers, shares, strict=True):
-                worker.send(actions[share])
+                _send(worker, actions[share])
             for worker, share in zip(workers, shares, strict=True):
-                obs[share], rewards, is_over[share] = worker.receive()
+                obs[share], rewards, is_over[share] = _receive(worker)
                 returns[share] += rewards
-    finally:
-        for worker in workers:
-            worker.close()
     return returns, lengths
 
 
-class _Worker:
-    """A `gymnasium_worker` process. Not `multiprocessing`, which would import the user's main module again."""
+def _send(worker: Popen, message: Any) -> None:
+    assert worker.stdin
+    send(worker.stdin, message)
 
-    def __init__(self) -> None:
-        self._process = start_module("evaluation.gymnasium_worker", stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
-    def send(self, message: Any) -> None:
-        assert self._process.stdin
-        pickle.dump(message, self._process.stdin, protocol=pickle.HIGHEST_PROTOCOL)
-        self._process.stdin.flush()
-
-    def receive(self) -> Any:
-        assert self._process.stdout
-        try:
-            return pickle.load(self._process.stdout)
-        except EOFError:
-            raise RuntimeError("a Gymnasium process ended; its error is above") from None
-
-    def close(self) -> None:
-        assert self._process.stdin and self._process.stdout
-        self._process.stdin.close()
-        self._process.stdout.close()
-        self._process.wait()
+def _receive(worker: Popen) -> Any:
+    assert worker.stdout
+    try:
+        return pickle.load(worker.stdout)
+    except EOFError:
+        raise RuntimeError("a Gymnasium process ended; its error is above") from None
 
 
 def score_in_sim(task: Task, policy: PolicyFn, num_episodes: int, seed: int = 0) -> Scores:
-    """Whole episodes in the task's own engine, all side by side."""
+    """Score complete episodes in the task's own engine, all in one batch."""
     returns, lengths = jax.jit(lambda key: evaluate(task, num_episodes, policy, key))(jax.random.PRNGKey(seed))
     name = f"{task.gymnasium_id} on {task.engine.name}"
     return Scores(np.asarray(returns, np.float64), np.asarray(lengths, np.int64), [seed], name)

@@ -1,13 +1,15 @@
-"""A process that steps real Gymnasium environments for `evaluation`: threads would wait for one another's Python.
+"""A child process that steps real Gymnasium environments; threads would block each other on Python's lock.
 
-It speaks pickles over its pipes. In: `(env id, keywords, seeds)`; out: observations. Then, until the input ends, in:
-actions; out: observations, rewards, and which episodes are over. An episode that is over is not stepped on.
+It exchanges pickles with its parent over pipes. It first reads `(env id, keywords, seeds)` and answers with the reset
+observations. Then it reads actions, and answers with observations, rewards and which episodes are over, until the
+input ends. Environments whose episode is over are not stepped.
 """
 
 import os
 import pickle
 import sys
 import warnings
+from typing import IO, Any
 
 import numpy as np
 
@@ -16,12 +18,12 @@ def serve() -> None:
     """Serve one parent.
 
     Raises:
-        EOFError, BrokenPipeError: it has closed its pipes.
+        EOFError, BrokenPipeError: the parent has closed the pipes.
     """
-    # Whatever a library prints must not end up between the pickles.
+    # A library's prints must not end up between the pickles, so they go to stderr.
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    warnings.simplefilter("ignore", DeprecationWarning)  # v4 is asked for knowingly
+    warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
     import gymnasium
 
     gymnasium.logger.min_level = gymnasium.logger.ERROR
@@ -29,17 +31,18 @@ def serve() -> None:
     envs = [gymnasium.make(name, **keywords) for _ in seeds]
     obs = np.stack([env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)])
     is_over = np.zeros(len(envs), bool)
-    _send(answers, obs)
+    send(answers, obs)
     while True:
         actions = pickle.load(sys.stdin.buffer)
         rewards = np.zeros(len(envs))
         for i in np.flatnonzero(~is_over):
             obs[i], rewards[i], terminated, truncated, _ = envs[i].step(actions[i])
             is_over[i] = terminated or truncated
-        _send(answers, (obs, rewards, is_over))
+        send(answers, (obs, rewards, is_over))
 
 
-def _send(pipe, message) -> None:
+def send(pipe: IO[bytes], message: Any) -> None:
+    """Write one message to a pipe, and flush it."""
     pickle.dump(message, pipe, protocol=pickle.HIGHEST_PROTOCOL)
     pipe.flush()
 
@@ -48,4 +51,4 @@ if __name__ == "__main__":
     try:
         serve()
     except (EOFError, BrokenPipeError):
-        os._exit(0)  # The parent has gone, or is done: nobody reads what is still buffered.
+        os._exit(0)  # the parent reads no more; a normal exit would try to flush the pipe

@@ -1,28 +1,31 @@
-"""How far an MJX engine is from MuJoCo's C library, one step at a time.
+"""Parity of an MJX engine with MuJoCo's C library, one step at a time.
 
-Long free-running trajectories prove nothing once a body has fallen: CPU Gymnasium diverges from itself after a
-perturbation of 1e-7. So every step starts anew from a state on a C trajectory.
+Every step starts from a state on a C trajectory. Free-running trajectories prove nothing once a body has fallen: CPU
+Gymnasium diverges from itself after a perturbation of 1e-7.
 """
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from mjx_walk.envs import State, Task, make_env
 
 TOLERANCES = {"qpos": (1e-6, 2e-5), "qvel": (5e-5, 2e-3), "other": (1e-4, 1e-2)}
-"""Median and 99th percentile of each step's worst element: absolute for the physics state, relative for observation
-blocks and rewards."""
+"""Limits of the median and the 99th percentile of each step's worst element.
+
+Errors of `qpos` and `qvel` are absolute; errors of observation blocks and rewards, `other`, are relative.
+"""
 
 AIRBORNE_HEIGHT = 1.0
-"""A third of the copies start this much higher, m."""
+"""A third of the environments start this much higher, m."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Error:
-    """The error of one quantity, of each step its worst element, over all steps compared."""
+    """The error of one quantity: statistics over all steps of each step's worst element."""
 
     name: str
     median: float
@@ -40,7 +43,7 @@ class Error:
 
 @dataclasses.dataclass(frozen=True)
 class Parity:
-    """The outcome of one comparison."""
+    """Result of comparing one engine with the reference."""
 
     errors: list[Error]
     num_steps: int
@@ -49,7 +52,7 @@ class Parity:
     termination_mismatches: int
     overflows: int
     nonfinite: int
-    """Steps whose physics broke in the engine; the state before them is kept, and each counts as terminated."""
+    """Steps whose physics broke in the engine. Each keeps the state before it and terminates."""
 
     @property
     def is_within(self) -> bool:
@@ -57,16 +60,16 @@ class Parity:
 
 
 def reference_states(task: Task, num_envs: int, num_steps: int, seed: int) -> tuple[State, jax.Array]:
-    """States on C trajectories under random actions, and the action taken from each.
+    """States on C trajectories under random actions, and the action taken in each state.
 
-    A third of the copies starts in the air; none is reset, so all lie on the floor in the end.
+    A third of the environments starts in the air. None is reset, so all lie on the floor in the end.
 
     Returns:
         `[num_steps · num_envs, …]`.
     """
     start_key, action_key = jax.random.split(jax.random.PRNGKey(seed))
     start = jax.vmap(task.reset)(jax.random.split(start_key, num_envs)).physics
-    height = 2 if task.options.name.startswith("humanoid") else 1
+    height = 2 if task.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 1  # of the root in `qpos`
     lift = jnp.where(jnp.arange(num_envs) % 3 == 0, AIRBORNE_HEIGHT, 0.0)
     state = jax.vmap(task.reset_to)(start.qpos.at[:, height].add(lift), start.qvel)
 
@@ -79,21 +82,21 @@ def reference_states(task: Task, num_envs: int, num_steps: int, seed: int) -> tu
 
 
 def one_step(task: Task, states: State, actions: jax.Array) -> State:
-    """The states, `[N, …]`, after one step, on the host."""
+    """Step states `[N, …]` once, and copy the result to the host."""
     return jax.device_get(jax.jit(jax.vmap(task.step))(states, actions))
 
 
 def compare(task: Task, expected: State, found: State) -> Parity:
-    """Hold two engines' outcomes of the same steps against each other.
+    """Compare two engines after the same steps.
 
     Args:
         task: on either engine.
-        expected: `[N, …]`, the reference's.
-        found: `[N, …]`, the engine's.
+        expected: states of the reference, `[N, …]`.
+        found: states of the engine, `[N, …]`.
     """
     errors = [
-        _error("qpos", expected.physics.qpos, found.physics.qpos, "qpos", is_relative=False),
-        _error("qvel", expected.physics.qvel, found.physics.qvel, "qvel", is_relative=False),
+        _error("qpos", expected.physics.qpos, found.physics.qpos, is_relative=False),
+        _error("qvel", expected.physics.qvel, found.physics.qvel, is_relative=False),
     ]
     start = 0
     for name, size in task.observation_blocks().items():
@@ -113,20 +116,21 @@ def compare(task: Task, expected: State, found: State) -> Parity:
     )
 
 
-def _error(name: str, expected: jax.Array, found: jax.Array, kind: str = "other", is_relative: bool = True) -> Error:
+def _error(name: str, expected: jax.Array, found: jax.Array, is_relative: bool = True) -> Error:
     difference = np.abs(np.float64(found) - expected)
     if is_relative:
         difference /= 1.0 + np.abs(expected)
     worst = difference.max(axis=1)
-    return Error(name, float(np.median(worst)), float(np.quantile(worst, 0.99)), TOLERANCES[kind])
+    limits = TOLERANCES.get(name, TOLERANCES["other"])
+    return Error(name, float(np.median(worst)), float(np.quantile(worst, 0.99)), limits)
 
 
 def check(name: str, version: str, physics: str, num_envs: int, num_steps: int, seed: int = 0) -> Parity:
-    """Compare one task on one engine with the reference, which runs on the CPU whatever the engine runs on."""
+    """Compare one task on one engine with the reference, which always runs on the CPU."""
+    engine = make_env(name, physics=physics, version=version)
     cpu = jax.local_devices(backend="cpu")[0]
     with jax.default_device(cpu):
         reference = make_env(name, physics="c", version=version)
         states, actions = jax.device_get(reference_states(reference, num_envs, num_steps, seed))
         expected = one_step(reference, states, actions)
-    engine = make_env(name, physics=physics, version=version)
     return compare(engine, expected, one_step(engine, states, actions))

@@ -1,6 +1,8 @@
-"""Other people's trainers, run as they are, to compare with."""
+"""Brax's trainers, measured with Brax's own code for comparison with ours."""
 
+import functools
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import brax.envs
@@ -10,18 +12,45 @@ from brax.training.agents.ppo import train as ppo
 from brax.training.agents.sac import networks as sac_networks
 from brax.training.agents.sac import train as sac
 
-from mjx_walk.algos.sac import SACConfig, make_sac
+from mjx_walk.algos.sac import SAC, SACConfig
 from mjx_walk.envs import State, TaskOptions, TrainableTask
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import PhysicsState
-from mjx_walk.training.trainer import make_chunk, make_init
+from mjx_walk.experiments.timing import Measurement
+from mjx_walk.training.programs import make_init, make_step
 
 _UNROLL_LENGTH = 10
 _EPISODE_LENGTH = 1000
+_SAC_SIZES: dict[str, dict[str, Any]] = {
+    "gpu": {"batch_size": 512, "grad_updates_per_step": 8, "replay_capacity": 1_000_000, "learning_starts": 1_000_000},
+    "cpu": {"batch_size": 64, "grad_updates_per_step": 4, "replay_capacity": 20_000, "learning_starts": 20_000},
+}
+
+
+def measure(algo: str, hardware: str) -> Iterator[Measurement]:
+    """Measure Brax's trainer of an algorithm, and for SAC also ours, on Brax's `humanoid`.
+
+    Args:
+        algo: `ppo` or `sac`.
+        hardware: `gpu` or `cpu`, the size of the training.
+    """
+    env = brax.envs.get_environment("humanoid", backend="mjx")
+    if algo == "ppo":
+        num_envs, *sizes = (2048, 1024, 32, 30) if hardware == "gpu" else (32, 16, 2, 3)
+        speed = brax_ppo_speed(env, num_envs, *sizes)
+        yield Measurement(f"Brax's PPO on its reduced humanoid, {num_envs} environments", speed, "env-steps/s")
+        return
+    num_envs, num_steps = (128, 300) if hardware == "gpu" else (16, 20)
+    config = SACConfig(unroll_length=1, observation_clip=None, **_SAC_SIZES[hardware])
+    ours = sac_speed(env, num_envs, config, num_steps)
+    yield Measurement("our SAC on Brax's humanoid", ours, "updates/s")
+    theirs = brax_sac_speed(env, num_envs, config, num_steps)
+    yield Measurement("Brax's SAC on Brax's humanoid", theirs, "updates/s")
+    yield Measurement("ours / Brax's", ours / theirs, "times")
 
 
 class BraxTask(TrainableTask):
-    """An environment of Brax's behind the face of a `Task`, so that our trainer and Brax's meet on the same one."""
+    """A Brax environment with the interface of a `Task`, so that both trainers run on the same environment."""
 
     def __init__(self, env: brax.envs.Env):
         self.env = env
@@ -52,34 +81,37 @@ class BraxTask(TrainableTask):
 
 
 def restore_device_put_replicated() -> None:
-    """Put back the function that JAX 0.10 removed and Brax 0.14.2 still calls; nothing where it exists."""
-    if hasattr(jax, "device_put_replicated"):
-        return
-
-    def device_put_replicated(tree: Any, devices: list[jax.Device]) -> Any:
-        assert len(devices) == 1, "the stand-in serves one device"
-        return jax.tree.map(lambda x: jax.device_put(jnp.asarray(x)[None], devices[0]), tree)
-
-    jax.device_put_replicated = device_put_replicated  # type: ignore[assignment]
+    """Restore the function that JAX 0.10 removed and Brax 0.14.2 still calls. Do nothing where JAX has it."""
+    if not hasattr(jax, "device_put_replicated"):
+        jax.device_put_replicated = _device_put_replicated  # type: ignore[assignment]
 
 
-def brax_ppo_speed(num_envs: int, batch_size: int, num_minibatches: int, num_updates: int) -> float:
-    """Steady environment steps per second of Brax's PPO on Brax's own, reduced `humanoid`.
+def _device_put_replicated(tree: Any, devices: list[jax.Device]) -> Any:
+    assert len(devices) == 1, "the replacement supports one device"
+    return jax.tree.map(lambda x: jax.device_put(jnp.asarray(x)[None], devices[0]), tree)
 
-    Settings: those of Brax's training notebook where they are not arguments; there 2,048, 1,024 and 32.
+
+def brax_ppo_speed(
+    env: brax.envs.Env, num_envs: int, batch_size: int, num_minibatches: int, num_iterations: int
+) -> float:
+    """Environment steps per second of Brax's PPO, after compilation.
+
+    Source: the settings of Brax's training notebook; it has 2,048 environments, a batch size of 1,024 and 32
+    minibatches.
 
     Args:
-        num_envs: copies, a divisor of `batch_size × num_minibatches`.
-        batch_size: pieces of ten steps in a minibatch.
-        num_minibatches: minibatches of an update.
-        num_updates: updates measured, after as many that compile and warm up.
+        env: Brax's environment.
+        num_envs: environments, a divisor of `batch_size × num_minibatches`.
+        batch_size: unrolls of ten steps in a minibatch.
+        num_minibatches: minibatches of an iteration.
+        num_iterations: iterations timed, after as many that compile and warm up.
     """
     restore_device_put_replicated()
     clock: list[tuple[float, int]] = []
     ppo.train(
-        environment=brax.envs.get_environment("humanoid", backend="mjx"),
-        num_timesteps=2 * num_updates * batch_size * num_minibatches * _UNROLL_LENGTH,
-        num_evals=3,  # so that the clock is read after each half
+        environment=env,
+        num_timesteps=2 * num_iterations * batch_size * num_minibatches * _UNROLL_LENGTH,
+        num_evals=3,  # the clock is read after each half
         episode_length=_EPISODE_LENGTH,
         num_envs=num_envs,
         unroll_length=_UNROLL_LENGTH,
@@ -99,64 +131,48 @@ def brax_ppo_speed(num_envs: int, batch_size: int, num_minibatches: int, num_upd
     return (steps_after - steps_before) / (end - start)
 
 
-def sac_update_speeds(
-    num_envs: int, batch_size: int, grad_updates_per_step: int, replay_capacity: int, num_steps: int
-) -> tuple[float, float]:
-    """Gradient updates per second of our SAC and of Brax's, on Brax's `humanoid`, once the replay is full.
-
-    Environment, networks (256-256), batch, updates per step and replay are the same; an update is one of critic,
-    policy and temperature.
+def sac_speed(env: brax.envs.Env, num_envs: int, config: SACConfig, num_steps: int) -> float:
+    """Gradient updates per second of our SAC once the replay is full; an update is of critic, policy and temperature.
 
     Args:
-        num_envs: copies.
-        batch_size: of an update.
-        grad_updates_per_step: for each step of all copies.
-        replay_capacity: transitions, all of them filled under an untrained policy before the clock starts.
-        num_steps: steps of all copies that are timed, after as many that compile and warm up.
-
-    Returns:
-        Ours and theirs.
+        env: Brax's environment.
+        num_envs: environments.
+        config: `learning_starts` fills the replay under an untrained policy before the clock starts.
+        num_steps: steps of all environments that are timed, after as many that compile and warm up.
     """
-    env = brax.envs.get_environment("humanoid", backend="mjx")
-    config = SACConfig(
-        unroll_length=1,
-        grad_updates_per_step=grad_updates_per_step,
-        batch_size=batch_size,
-        replay_capacity=replay_capacity,
-        learning_starts=replay_capacity,
-        observation_clip=None,
-    )
-    algorithm = make_sac(BraxTask(env), num_envs, EvaluationConfig(1), config)  # type: ignore[arg-type]
-    chunk = make_chunk(algorithm, num_steps, fused=True)
-    state = make_init(algorithm)(jax.random.PRNGKey(0))
+    algorithm = SAC(BraxTask(env), num_envs, EvaluationConfig(1), config)  # type: ignore[arg-type]
+    call = make_step(algorithm.collect, algorithm.learn, num_steps, fused=True)
+    state: Any = make_init(algorithm.init)(jax.random.PRNGKey(0))
     while int(state.critic_updates) == 0:
-        state, _ = chunk(state)
+        state, _ = call(state)
     before, start = int(state.critic_updates), time.monotonic()
-    state, _ = jax.block_until_ready(chunk(state))
-    ours = (int(state.critic_updates) - before) / (time.monotonic() - start)
-    del state
+    state, _ = jax.block_until_ready(call(state))
+    return (int(state.critic_updates) - before) / (time.monotonic() - start)
 
+
+def brax_sac_speed(env: brax.envs.Env, num_envs: int, config: SACConfig, num_steps: int) -> float:
+    """Gradient updates per second of Brax's SAC under the settings of ours; arguments as for `sac_speed`."""
     restore_device_put_replicated()
     speeds: list[float] = []
-    prefill = -(-replay_capacity // num_envs) * num_envs
+    prefill = -(-config.replay_capacity // num_envs) * num_envs
     sac.train(
         environment=env,
         num_timesteps=prefill + 2 * num_steps * num_envs,
-        num_evals=3,  # so that two pieces of equal length are timed; the first one compiles
+        num_evals=3,  # the training has two timed halves, of which the first one compiles
         num_eval_envs=1,
         episode_length=_EPISODE_LENGTH,
         num_envs=num_envs,
         learning_rate=config.policy_learning_rate,
         discounting=config.discount,
-        batch_size=batch_size,
+        batch_size=config.batch_size,
         normalize_observations=True,
         tau=config.tau,
-        min_replay_size=replay_capacity,
-        max_replay_size=replay_capacity,
-        grad_updates_per_step=grad_updates_per_step,
-        network_factory=lambda *args, **kwargs: sac_networks.make_sac_networks(
-            *args, hidden_layer_sizes=(256, 256), **kwargs
+        min_replay_size=config.replay_capacity,
+        max_replay_size=config.replay_capacity,
+        grad_updates_per_step=config.grad_updates_per_step,
+        network_factory=functools.partial(
+            sac_networks.make_sac_networks, hidden_layer_sizes=tuple(config.policy_hidden_layer_sizes)
         ),
         progress_fn=lambda _, metrics: speeds.append(float(metrics.get("training/sps", 0.0))),
     )
-    return ours, speeds[-1] / num_envs * grad_updates_per_step
+    return speeds[-1] / num_envs * config.grad_updates_per_step

@@ -1,6 +1,5 @@
-"""What a folder of runs says about their algorithms and settings: curves, a table, a figure."""
+"""Reports on a folder of runs, grouped by algorithm and settings: learning curves, a Markdown table and a CSV file."""
 
-import csv
 import dataclasses
 import json
 import warnings
@@ -13,28 +12,28 @@ import numpy as np
 import scipy.stats
 
 from mjx_walk.runs.config import Config, flatten, read_config
-from mjx_walk.runs.metrics import Row, read_rows
+from mjx_walk.runs.metrics import Row, read_rows, write_csv
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
-from mjx_walk.viewing.curves import AXES, series_of
+from mjx_walk.viewing.curves import learning_axes, series
 
 MIN_SEEDS_FOR_INTERVALS = 5
 _POINTS = 200
-_QUANTITIES = (("episode/return", "return"), ("episode/length", "episode length"))
 
 
 @dataclasses.dataclass(frozen=True)
-class Curve:
-    """One run."""
+class LoggedRun:
+    """One run and what it has logged."""
 
     config: Config
     rows: list[Row]
-    scores: dict | None
-    """Of `eval_gymnasium.json`."""
+    """At least one."""
+    scores: dict[str, Any] | None
+    """Contents of `eval_gymnasium.json`."""
 
 
-def read_runs(folder: Path) -> list[Curve]:
-    """All runs below a folder that have logged something, however they came there.
+def read_runs(folder: Path) -> list[LoggedRun]:
+    """Read all runs below a folder that have logged something.
 
     Raises:
         UserError: there are none, or they are of different environments.
@@ -44,7 +43,7 @@ def read_runs(folder: Path) -> list[Curve]:
         run = RunFolder(path.parent)
         rows = read_rows(run.metrics)
         if rows:
-            runs.append(Curve(read_config(path), rows, _scores(run)))
+            runs.append(LoggedRun(read_config(path), rows, _scores(run)))
     if not runs:
         raise UserError(f"no runs below '{folder}' have logged anything yet")
     names = {f"{run.config.env.name} {run.config.env.version}" for run in runs}
@@ -54,7 +53,7 @@ def read_runs(folder: Path) -> list[Curve]:
 
 
 def _scores(run: RunFolder) -> dict[str, Any] | None:
-    """What is in a run's `eval_gymnasium.json`, if it has one that can be read."""
+    """Contents of a run's `eval_gymnasium.json`, if the file exists and can be read."""
     if not run.gymnasium_scores.exists():
         return None
     try:
@@ -64,13 +63,16 @@ def _scores(run: RunFolder) -> dict[str, Any] | None:
         return None
 
 
-def group(runs: list[Curve]) -> dict[str, list[Curve]]:
-    """Runs that differ in their seed alone, under the algorithm's name and whatever sets them apart from others of
-    its kind."""
+def group(runs: list[LoggedRun]) -> dict[str, list[LoggedRun]]:
+    """Group runs that differ only in their seed.
+
+    Returns:
+        The groups by label: the algorithm, and the settings in which its groups differ.
+    """
     by_algo = defaultdict(list)
     for run in runs:
         by_algo[run.config.algo.name].append(run)
-    groups: dict[str, list[Curve]] = defaultdict(list)
+    groups: dict[str, list[LoggedRun]] = defaultdict(list)
     for name, same in by_algo.items():
         settings = [_settings(run.config) for run in same]
         varying = [key for key in settings[0] if any(other.get(key) != settings[0][key] for other in settings)]
@@ -80,11 +82,15 @@ def group(runs: list[Curve]) -> dict[str, list[Curve]]:
     return dict(groups)
 
 
+def _settings(config: Config) -> dict[str, Any]:
+    return {key: value for key, value in flatten(config).items() if key not in ("run_dir", "resume", "seed")}
+
+
 def mean_curve(curves: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The mean of several curves, where all of them have values; nothing where they do not overlap.
+    """Mean of several curves over the range that all of them cover, which may be empty.
 
     Args:
-        curves: `(x, y)` each, x rising.
+        curves: `(x, y)` each, with rising x.
 
     Returns:
         x, `[P]`; the mean, `[P]`; and all curves at x, `[curves, P]`.
@@ -112,93 +118,82 @@ def write_report(folder: Path) -> Path:
         The Markdown file.
 
     Raises:
-        UserError: see `read_runs`; or the folder cannot be written to.
+        UserError: `read_runs` fails, or the folder cannot be written to.
     """
     groups = group(read_runs(folder))
     path = folder / "comparison.md"
     try:
         _draw(groups, folder / "comparison.png")
-        _write_csv(groups, folder / "comparison.csv")
+        write_csv([_csv_row(name, run) for name, runs in groups.items() for run in runs], folder / "comparison.csv")
         path.write_text(_markdown(groups))
     except OSError as error:
         raise UserError(f"cannot write to '{folder}': {error.strerror}") from error
     return path
 
 
-def _settings(config: Config) -> dict:
-    return {key: value for key, value in flatten(config).items() if key not in ("run_dir", "resume", "seed")}
-
-
-def _draw(groups: dict[str, list[Curve]], path: Path) -> None:
+def _draw(groups: dict[str, list[LoggedRun]], path: Path) -> None:
+    """Draw every run thin and the mean of its group bold."""
     figure = matplotlib.figure.Figure(figsize=(12, 8), layout="constrained")
-    grid = figure.subplots(2, 2, sharex="col")
-    for line, (quantity, title) in enumerate(_QUANTITIES):
-        for column, (axis, unit, label) in enumerate(AXES):
-            plot = grid[line][column]
-            for number, (name, runs) in enumerate(groups.items()):
-                series = [series_of(run.rows, axis, quantity) for run in runs]
-                curves = [(np.array(xs) / unit, np.array(ys)) for xs, ys in series if xs]
-                if not curves:
-                    continue
-                color = f"C{number % 10}"
-                for curve in curves:
-                    plot.plot(*curve, color=color, alpha=0.35, linewidth=0.8)
-                x, mean, values = mean_curve(curves)
-                plot.plot(x, mean, color=color, linewidth=2.2, label=f"{name} ({len(curves)})")
-                bounds = interval(values)
-                if bounds:
-                    plot.fill_between(x, *bounds, color=color, alpha=0.2, linewidth=0)
-            plot.set_ylabel(title)
-            plot.grid(alpha=0.3)
-            if line:
-                plot.set_xlabel(label)
+    for axes, quantity, key, unit in learning_axes(figure):
+        for number, (name, runs) in enumerate(groups.items()):
+            found = [series(run.rows, key, f"episode/{quantity}") for run in runs]
+            curves = [(x / unit, y) for x, y in found if x.size]
+            if not curves:
+                continue
+            color = f"C{number % 10}"
+            for curve in curves:
+                axes.plot(*curve, color=color, alpha=0.35, linewidth=0.8)
+            x, mean, values = mean_curve(curves)
+            axes.plot(x, mean, color=color, linewidth=2.2, label=f"{name} ({len(curves)})")
+            bounds = interval(values)
+            if bounds:
+                axes.fill_between(x, *bounds, color=color, alpha=0.2, linewidth=0)
     env = next(iter(groups.values()))[0].config.env
-    figure.suptitle(f"{env.name} {env.version}: every seed thin, their mean bold, while training")
-    handles, labels = grid[0][0].get_legend_handles_labels()
+    figure.suptitle(f"{env.name} {env.version}, during training: each seed thin, their mean bold")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
     if handles:
-        columns = max(160 // (len(max(labels, key=len)) + 8), 1)  # as fit side by side
-        figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=9)
+        num_columns = max(160 // (len(max(labels, key=len)) + 8), 1)  # as many as fit the figure's width
+        figure.legend(handles, labels, loc="outside lower center", ncols=num_columns, fontsize=9)
     figure.savefig(path, dpi=110)
 
 
-def _markdown(groups: dict[str, list[Curve]]) -> str:
-    lines = [
-        "| variant | seeds | score in Gymnasium, mean over seeds | spread (std) | 95% interval | lowest seed "
-        "| million steps | seconds |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for name, runs in groups.items():
-        scores = np.array([run.scores["mean"] for run in runs if run.scores])
-        bounds = interval(scores)
-        cells = [
-            name,
-            f"{len(scores)} of {len(runs)} scored" if len(scores) < len(runs) else str(len(runs)),
-            f"{scores.mean():,.0f}" if len(scores) else "–",
-            f"{scores.std(ddof=1):,.0f}" if len(scores) > 1 else "–",
-            f"{bounds[0]:,.0f} to {bounds[1]:,.0f}" if bounds else "–",
-            f"{scores.min():,.0f}" if len(scores) else "–",
-            f"{np.mean([run.rows[-1]['env_steps'] for run in runs]) / 1e6:,.2f}",
-            f"{np.mean([run.rows[-1]['wall_seconds'] for run in runs]):,.0f}" + _side_by_side(runs),
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+def _markdown(groups: dict[str, list[LoggedRun]]) -> str:
+    """A table with a row per group."""
+    table = [_markdown_row(name, runs) for name, runs in groups.items()]
+    lines = [list(table[0]), ["---"] * len(table[0]), *(list(row.values()) for row in table)]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def _side_by_side(runs: list[Curve]) -> str:
-    """With how many seeds their seconds were shared."""
-    together = sorted({int(run.rows[-1].get("speed/seeds_together", 1)) for run in runs})
-    return "" if together == [1] else f", {' or '.join(map(str, together))} seeds side by side"
+def _markdown_row(variant: str, runs: list[LoggedRun]) -> dict[str, str]:
+    scores = np.array([run.scores["mean"] for run in runs if run.scores])
+    bounds = interval(scores)
+    return {
+        "variant": variant,
+        "seeds": f"{len(scores)} of {len(runs)} scored" if len(scores) < len(runs) else str(len(runs)),
+        "score in Gymnasium, mean over seeds": f"{scores.mean():,.0f}" if len(scores) else "–",
+        "spread (std)": f"{scores.std(ddof=1):,.0f}" if len(scores) > 1 else "–",
+        "95% interval": f"{bounds[0]:,.0f} to {bounds[1]:,.0f}" if bounds else "–",
+        "lowest seed": f"{scores.min():,.0f}" if len(scores) else "–",
+        "million steps": f"{np.mean([run.rows[-1]['env_steps'] for run in runs]) / 1e6:,.2f}",
+        "seconds": f"{np.mean([run.rows[-1]['wall_seconds'] for run in runs]):,.0f}",
+        "seeds per process": " or ".join(map(str, sorted({int(_seeds_together(run)) for run in runs}))),
+    }
 
 
-def _write_csv(groups: dict[str, list[Curve]], path: Path) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        figures = ("gymnasium_mean", "gymnasium_std", "env_steps", "wall_seconds", "seeds_together")
-        writer.writerow(["variant", "seed", *figures, "run_dir"])
-        for name, runs in groups.items():
-            for run in runs:
-                scores, last = run.scores or {}, run.rows[-1]
-                writer.writerow(
-                    [name, run.config.seed, scores.get("mean"), scores.get("std"), last["env_steps"],
-                     last["wall_seconds"], last.get("speed/seeds_together", 1), run.config.run_dir]
-                )  # fmt: skip
+def _csv_row(variant: str, run: LoggedRun) -> dict[str, Any]:
+    scores, last = run.scores or {}, run.rows[-1]
+    return {
+        "variant": variant,
+        "seed": run.config.seed,
+        "gymnasium_mean": scores.get("mean"),
+        "gymnasium_std": scores.get("std"),
+        "env_steps": last["env_steps"],
+        "wall_seconds": last["wall_seconds"],
+        "seeds_together": _seeds_together(run),
+        "run_dir": run.config.run_dir,
+    }
+
+
+def _seeds_together(run: LoggedRun) -> float:
+    """Number of seeds that shared the run's process, and so its seconds."""
+    return run.rows[-1].get("speed/seeds_together", 1)

@@ -1,4 +1,4 @@
-"""A task as a `brax.envs.Env`, for code written for Brax: its wrappers, its trainers, its own algorithms."""
+"""A task as a `brax.envs.Env`, for Brax's wrappers and trainers and for algorithms written against them."""
 
 from typing import Any
 
@@ -11,9 +11,9 @@ from mjx_walk.envs import NO_TIME_LIMIT, make_env
 
 
 class BraxEnv(base.Env):
-    """One unbatched copy. Actions are Brax's, in [-1, 1] whatever the motors' range; the rest is Gymnasium's task.
+    """One unbatched environment. It is Gymnasium's task, except that actions are Brax's: in [-1, 1] for every motor.
 
-    The time limit is that of Brax's `EpisodeWrapper`, as for its own environments.
+    It has no time limit of its own; Brax's `EpisodeWrapper` adds one, as for Brax's environments.
     """
 
     def __init__(self, env: str, physics: str = "auto", **keywords: Any):
@@ -21,7 +21,7 @@ class BraxEnv(base.Env):
         Args:
             env: name of the task.
             physics: engine.
-            keywords: Gymnasium's, and those of `TaskOptions` but for the time limit.
+            keywords: Gymnasium's, and those of `TaskOptions` except the time limit.
 
         Raises:
             UserError: an unknown name, engine or keyword.
@@ -29,12 +29,12 @@ class BraxEnv(base.Env):
         self._task = make_env(env, physics, **keywords | {"max_episode_steps": NO_TIME_LIMIT})
 
     def reset(self, rng: jax.Array) -> base.State:
-        """A random start; `pipeline_state` is this package's own `State`."""
+        """Start an episode at random. `pipeline_state` holds this package's `State`."""
         state = self._task.reset(rng)
         return base.State(state, state.obs, state.reward, jnp.zeros(()), state.metrics)
 
     def step(self, state: base.State, action: jax.Array) -> base.State:
-        """One step; `done` is a fall, never the time limit."""
+        """Step once. `done` means that the task ended the episode; the time limit never sets it."""
         after = self._task.step(state.pipeline_state, to_env_action(self._task, action))
         return state.replace(
             pipeline_state=after,

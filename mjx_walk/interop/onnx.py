@@ -1,69 +1,56 @@
-"""A policy as an ONNX graph, translated from its jaxpr, so that it is the policy that was trained by construction.
+"""Export of a policy to ONNX, translated from its jaxpr, so that the file computes exactly what JAX computes.
 
-jax2onnx would do it, but its releases that run on the versions used here exclude each other with them (Orbax), or give
-graphs that onnxruntime refuses.
+We do not use jax2onnx: its releases conflict with the Orbax version used here, or give graphs that onnxruntime rejects.
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import onnx
+from jax.extend import core
 from onnx import TensorProto, helper, numpy_helper
 
 from mjx_walk.utils.errors import UserError
 
 _OPSET = 17
-_SAME = {
-    "abs": "Abs",
-    "add": "Add",
-    "div": "Div",
+_UNARY = ("abs", "erf", "exp", "log", "neg", "not", "sign", "sqrt", "tanh")
+_BINARY = ("add", "div", "max", "min", "mul", "pow", "sub")
+_OPERATORS = {name: name.capitalize() for name in _UNARY + _BINARY} | {
     "eq": "Equal",
-    "erf": "Erf",
-    "exp": "Exp",
     "ge": "GreaterOrEqual",
     "gt": "Greater",
     "le": "LessOrEqual",
-    "log": "Log",
     "logistic": "Sigmoid",
     "lt": "Less",
-    "max": "Max",
-    "min": "Min",
-    "mul": "Mul",
-    "neg": "Neg",
-    "not": "Not",
-    "pow": "Pow",
-    "sign": "Sign",
-    "sqrt": "Sqrt",
-    "sub": "Sub",
-    "tanh": "Tanh",
 }
-"""JAX's primitives that ONNX has, too."""
+"""JAX's primitives with an ONNX operator of the same meaning."""
 _INLINED = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 _SHAPES_ONLY = ("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "copy", "stop_gradient")
 
 
 def translate(policy: Callable[[jax.Array], jax.Array], observation_size: int, name: str) -> onnx.ModelProto:
-    """Translate a policy.
+    """Translate a policy to ONNX.
 
     Args:
-        policy: `[observation_size] f32 → [action_size] f32`, of a vector.
-        observation_size: its size.
+        policy: `[observation_size] f32 → [action_size] f32`, unbatched.
+        observation_size: size of its input.
         name: of the graph.
 
     Returns:
-        A model from `observation`, `[N, observation_size] f64`, to `action`, `[N, action_size] f32`, both Gymnasium's.
+        A model with the input `observation`, `[N, observation_size] f64`, and the output `action`,
+        `[N, action_size] f32`, both in Gymnasium's units.
 
     Raises:
-        UserError: the policy does something that there is no translation for.
+        UserError: the policy uses a primitive that has no translation.
     """
     closed = jax.make_jaxpr(policy)(jnp.zeros(observation_size))
     graph = _Graph()
     obs = graph.add("Cast", ["observation"], to=TensorProto.FLOAT)
-    (action,) = graph.follow(closed.jaxpr, closed.consts, [obs])
+    (action,) = graph.follow(closed.jaxpr, closed.consts, obs)
     graph.nodes.append(helper.make_node("Identity", [graph.name(action)], ["action"]))
     model = helper.make_model(
         helper.make_graph(
@@ -82,10 +69,11 @@ def translate(policy: Callable[[jax.Array], jax.Array], observation_size: int, n
 
 
 class _Graph:
-    """ONNX nodes as they come. A value is the name of an output where it depends on the observation, else its array.
+    """The ONNX graph under construction.
 
-    What depends on the observation has no batch axis in the jaxpr, but one in front here: a vector is `[N, size]`, a
-    scalar `[N, 1]`. So ONNX's broadcasting does what JAX's changes of shape do.
+    A value that depends on the observation is the name of a node's output; any other value is an array. Values that
+    depend on the observation gain a leading batch axis: a vector is `[N, size]`, a scalar `[N, 1]`. ONNX then
+    broadcasts them where JAX changes shapes.
     """
 
     def __init__(self) -> None:
@@ -93,21 +81,21 @@ class _Graph:
         self.initializers: list[onnx.TensorProto] = []
         self._count = itertools.count()
 
-    def add(self, kind: str, inputs: list[Any], num_outputs: int = 1, **attributes: Any) -> Any:
-        """A node; its output's name, or a list of names."""
+    def add(self, kind: str, inputs: list[Any], num_outputs: int = 1, **attributes: Any) -> list[str]:
+        """Append a node and return the names of its outputs."""
         names = [f"v{next(self._count)}" for _ in range(num_outputs)]
         self.nodes.append(helper.make_node(kind, [self.name(x) for x in inputs], names, **attributes))
-        return names[0] if num_outputs == 1 else names
+        return names
 
     def name(self, value: Any) -> str:
-        """A value's name; an array becomes a part of the model."""
+        """Name of a value; an array is stored in the model first."""
         if isinstance(value, str):
             return value
         self.initializers.append(numpy_helper.from_array(np.asarray(value), f"c{next(self._count)}"))
         return self.initializers[-1].name
 
     def needed_for(self, output: str) -> list[onnx.NodeProto]:
-        """The nodes that an output depends on, in order; the arrays that no other node needs are dropped."""
+        """The nodes that an output depends on, in order. Arrays that they do not use are dropped."""
         wanted, kept = {output}, []
         for node in reversed(self.nodes):
             if wanted.intersection(node.output):
@@ -116,35 +104,31 @@ class _Graph:
         self.initializers = [array for array in self.initializers if array.name in wanted]
         return kept[::-1]
 
-    def follow(self, jaxpr: Any, consts: list[Any], arguments: list[Any]) -> list[Any]:
-        """Translate a jaxpr; its outputs."""
+    def follow(self, jaxpr: core.Jaxpr, consts: Sequence[Any], arguments: list[Any]) -> list[Any]:
+        """Append the nodes of a jaxpr and return its outputs."""
         values: dict[Any, Any] = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *arguments), strict=True))
-
-        def read(variable: Any) -> Any:
-            return variable.val if hasattr(variable, "val") else values[variable]
-
         for equation in jaxpr.eqns:
-            inputs = [read(variable) for variable in equation.invars]
+            inputs = _lookup(values, equation.invars)
             if equation.primitive.name in _INLINED:
                 inner = next(equation.params[key] for key in ("jaxpr", "call_jaxpr") if key in equation.params)
-                outputs = self.follow(getattr(inner, "jaxpr", inner), getattr(inner, "consts", []), inputs)
-            elif not any(isinstance(value, str) for value in inputs):
+                closed = inner if isinstance(inner, core.ClosedJaxpr) else core.ClosedJaxpr(inner, ())
+                outputs = self.follow(closed.jaxpr, closed.consts, inputs)
+            elif any(isinstance(value, str) for value in inputs):
+                outputs = self._nodes(equation, inputs)
+            else:
                 found = equation.primitive.bind(*inputs, **equation.params)
                 outputs = found if equation.primitive.multiple_results else [found]
-            else:
-                found = self._node(equation, inputs)
-                outputs = found if isinstance(found, list) else [found]
             values |= zip(equation.outvars, outputs, strict=True)
-        return [read(variable) for variable in jaxpr.outvars]
+        return _lookup(values, jaxpr.outvars)
 
-    def _node(self, equation: Any, inputs: list[Any]) -> Any:
-        """The nodes of one primitive that depends on the observation."""
+    def _nodes(self, equation: core.JaxprEqn, inputs: list[Any]) -> list[Any]:
+        """Append the nodes of one primitive that depends on the observation, and return its outputs."""
         kind, params = equation.primitive.name, equation.params
         first = inputs[0]
         if kind in _SHAPES_ONLY:
-            return first
-        if kind in _SAME:
-            return self.add(_SAME[kind], inputs)
+            return [first]
+        if kind in _OPERATORS:
+            return self.add(_OPERATORS[kind], inputs)
         if kind == "dot_general" and isinstance(first, str) and params["dimension_numbers"] == (((0,), (0,)), ((), ())):
             return self.add("MatMul", inputs)
         if kind == "convert_element_type":
@@ -154,13 +138,13 @@ class _Graph:
         if kind == "integer_pow":
             return self.add("Pow", [first, np.float32(params["y"])])
         if kind == "rsqrt":
-            return self.add("Reciprocal", [self.add("Sqrt", [first])])
+            return self.add("Reciprocal", self.add("Sqrt", [first]))
         if kind == "expm1":
-            return self.add("Sub", [self.add("Exp", [first]), np.float32(1.0)])
+            return self.add("Sub", [*self.add("Exp", [first]), np.float32(1.0)])
         if kind == "log1p":
-            return self.add("Log", [self.add("Add", [first, np.float32(1.0)])])
+            return self.add("Log", self.add("Add", [first, np.float32(1.0)]))
         if kind == "ne":
-            return self.add("Not", [self.add("Equal", inputs)])
+            return self.add("Not", self.add("Equal", inputs))
         if kind == "select_n" and len(inputs) == 3:
             return self.add("Where", [first, inputs[2], inputs[1]])
         if kind == "reduce_sum":
@@ -168,3 +152,8 @@ class _Graph:
         if kind == "split":
             return self.add("Split", [first, np.array(params["sizes"])], len(params["sizes"]), axis=-1)
         raise UserError(f"the policy cannot be exported: there is no translation for '{kind}'")
+
+
+def _lookup(values: dict[Any, Any], variables: Sequence[Any]) -> list[Any]:
+    """Values of a jaxpr's variables; a literal holds its own."""
+    return [variable.val if isinstance(variable, core.Literal) else values[variable] for variable in variables]

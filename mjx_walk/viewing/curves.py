@@ -1,28 +1,33 @@
 """Learning curves, reward terms and losses of a run, drawn from its `metrics.jsonl`."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import matplotlib.figure
+import numpy as np
+from matplotlib.axes import Axes
 
 from mjx_walk.runs.metrics import Row, read_rows, write_csv
 from mjx_walk.runs.run_folder import RunFolder
 
-AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))
-"""What curves are drawn against: the key of a row, its unit, its label."""
+_X_AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))
+"""Key of a row, unit and label of each horizontal axis."""
+_QUANTITIES = (("return", "return"), ("length", "episode length"))
+"""Key of a row after its prefix, and label, of each vertical axis."""
 
 
 def plot_run(folder: RunFolder) -> list[Path]:
-    """Draw the curves that `metrics.jsonl` holds.
+    """Draw the curves of a run into its folder.
 
     Returns:
-        `learning_curve.png` (return and episode length against steps and wall-clock), `reward_terms.png`,
-        `losses.png`, and `metrics.csv`, all rows as a table; none where nothing was logged.
+        `learning_curve.png` (return and episode length against steps and seconds), `reward_terms.png`,
+        `losses.png`, and `metrics.csv` with all rows. The list is empty if nothing is logged yet.
     """
     rows = read_rows(folder.metrics)
     if not rows:
         return []
-    terms = sorted({k for row in rows for k in row if k.startswith("episode/reward_")})
-    losses = sorted({k for row in rows for k in row if k.startswith("train/")})
+    terms = sorted({key for row in rows for key in row if key.startswith("episode/reward_")})
+    losses = sorted({key for row in rows for key in row if key.startswith("train/")})
     return [
         _learning_curve(rows, folder.path / "learning_curve.png"),
         _grid(rows, terms, "per episode", folder.path / "reward_terms.png"),
@@ -31,46 +36,58 @@ def plot_run(folder: RunFolder) -> list[Path]:
     ]
 
 
-def series_of(rows: list[Row], x: str, y: str) -> tuple[list[float], list[float]]:
-    """The values of `x` and `y` in those rows that have the latter."""
+def series(rows: list[Row], x: str, y: str) -> np.ndarray:
+    """Values of `x` and `y` in the rows that have `y`, `[2, N] f64`."""
     pairs = [(row[x], row[y]) for row in rows if row.get(y) is not None]
-    return [p[0] for p in pairs], [p[1] for p in pairs]
+    return np.array(pairs, np.float64).reshape(-1, 2).T
+
+
+def learning_axes(figure: matplotlib.figure.Figure) -> Iterator[tuple[Axes, str, str, float]]:
+    """Add four labelled plots to a figure: return and episode length against steps and seconds.
+
+    Returns:
+        For each plot its axes, the quantity (`return` or `length`), and the key and the unit of its horizontal axis.
+    """
+    grid = figure.subplots(2, 2, sharex="col")
+    for axes_row, (quantity, title) in zip(grid, _QUANTITIES, strict=True):
+        for axes, (key, unit, label) in zip(axes_row, _X_AXES, strict=True):
+            axes.set_ylabel(title)
+            axes.grid(alpha=0.3)
+            if axes in grid[-1]:
+                axes.set_xlabel(label)
+            yield axes, quantity, key, unit
 
 
 def _learning_curve(rows: list[Row], path: Path) -> Path:
     figure = matplotlib.figure.Figure(figsize=(10, 6.5), layout="constrained")
-    grid = figure.subplots(2, 2, sharex="col")
-    for column, (axis, unit, label) in enumerate(AXES):
-        for line, (quantity, title) in enumerate((("return", "return"), ("length", "episode length"))):
-            plot = grid[line][column]
-            for source, style in (("episode", {"alpha": 0.6}), ("eval", {"marker": "o", "markersize": 4})):
-                is_eval = source == "eval" and axis == "env_steps"
-                xs, ys = series_of(rows, "eval/env_steps" if is_eval else axis, f"{source}/{quantity}")
-                if xs:
-                    name = {"episode": "while training", "eval": "deterministic evaluation"}[source]
-                    plot.plot([x / unit for x in xs], ys, label=name, **style)
-            plot.set_ylabel(title)
-            plot.grid(alpha=0.3)
-        grid[1][column].set_xlabel(label)
-    if grid[0][0].get_legend_handles_labels()[0]:
-        grid[0][0].legend()
+    for axes, quantity, key, unit in learning_axes(figure):
+        x, y = series(rows, key, f"episode/{quantity}")
+        if x.size:
+            axes.plot(x / unit, y, label="while training", alpha=0.6)
+        x, y = series(rows, "eval/env_steps" if key == "env_steps" else key, f"eval/{quantity}")
+        if x.size:
+            axes.plot(x / unit, y, label="deterministic evaluation", marker="o", markersize=4)
+    first = figure.axes[0]
+    if first.get_legend_handles_labels()[0]:
+        first.legend()
     figure.savefig(path, dpi=110)
     return path
 
 
 def _grid(rows: list[Row], names: list[str], ylabel: str, path: Path) -> Path:
-    columns = min(len(names), 4) or 1
-    lines = -(-len(names) // columns) or 1
-    figure = matplotlib.figure.Figure(figsize=(3.4 * columns, 2.4 * lines), layout="constrained")
-    plots = figure.subplots(lines, columns, squeeze=False).flat
+    """Draw one small plot per metric."""
+    num_columns = min(len(names), 4) or 1
+    num_rows = -(-len(names) // num_columns) or 1
+    figure = matplotlib.figure.Figure(figsize=(3.4 * num_columns, 2.4 * num_rows), layout="constrained")
+    plots = figure.subplots(num_rows, num_columns, squeeze=False).flat
     for unused in plots[len(names) :]:
         unused.set_axis_off()
-    for plot, name in zip(plots, names, strict=False):
-        xs, ys = series_of(rows, "env_steps", name)
-        plot.plot([x / 1e6 for x in xs], ys)
-        plot.set_title(name.partition("/")[2], fontsize=9)
-        plot.set_xlabel("million steps", fontsize=8)
-        plot.set_ylabel(ylabel, fontsize=8)
-        plot.grid(alpha=0.3)
+    for axes, name in zip(plots, names, strict=False):
+        x, y = series(rows, "env_steps", name)
+        axes.plot(x / 1e6, y)
+        axes.set_title(name.partition("/")[2], fontsize=9)
+        axes.set_xlabel("million steps", fontsize=8)
+        axes.set_ylabel(ylabel, fontsize=8)
+        axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
     return path

@@ -1,7 +1,8 @@
-"""One episode of a policy in the real Gymnasium, kept to be looked at."""
+"""One episode of a policy in the real Gymnasium, recorded for drawing."""
 
 import dataclasses
 import warnings
+from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
@@ -19,40 +20,43 @@ _CAMERA = {
     "azimuth": 90.0,
     "elevation": -8.0,
 }
-"""From the side, following the torso. Gymnasium's own default stands still in version 1.4, and films an empty floor."""
+"""Follows the torso from the side. Gymnasium 1.4's own default stands still and films an empty floor."""
+_FLOOR_SCALE = 20.0
+"""MuJoCo draws a plane only as large as its `size`; a fast runner leaves it after 3 seconds."""
 
 
 @dataclasses.dataclass
 class Episode:
-    """T steps; quantities after each, in MuJoCo's units (m, rad, s, N·m)."""
+    """T recorded steps; each quantity is the one after its step, in MuJoCo's units (m, rad, s, N·m)."""
 
     env: str
+    """Gymnasium's name of the environment."""
     model: mujoco.MjModel
     seconds_per_step: float
     qpos: np.ndarray
     """`[T, nq]`."""
     torso: np.ndarray
-    """`[T, 3]`, the position of the first body."""
+    """`[T, 3]`, position of the first body."""
     torques: np.ndarray
-    """`[T, nu]`, what the motors exert."""
+    """`[T, nu]`, torque of each motor."""
     floor_contacts: np.ndarray
     """`[T, nbody] bool`: the body touches the floor."""
     rewards: np.ndarray
     """`[T]`."""
     reward_terms: dict[str, np.ndarray]
-    """`[T]` each, as Gymnasium's `info` has them."""
+    """`[T]` each, under the names of Gymnasium's `info`."""
     frames: list[np.ndarray]
-    """`[height, width, 3] u8`, one for every `steps_per_frame`; empty if nothing was rendered."""
+    """`[height, width, 3] u8` each, one every `steps_per_frame` steps; empty if nothing was rendered."""
     steps_per_frame: int
 
     @property
     def seconds(self) -> np.ndarray:
-        """`[T]`, since the start."""
+        """Time since the start, `[T]`."""
         return self.seconds_per_step * np.arange(1, len(self.rewards) + 1)
 
     @property
     def frames_per_second(self) -> float:
-        """At which the film runs in real time."""
+        """Frame rate of a film in real time."""
         return 1.0 / (self.seconds_per_step * self.steps_per_frame)
 
 
@@ -66,30 +70,21 @@ def record_episode(
     """Play one episode in `gymnasium.make`.
 
     Args:
-        task: says which environment, with which keywords.
+        task: the environment and its keywords.
         policy: `[observation_size] → [action_size]`, both in Gymnasium's units.
         seed: of the reset.
-        size: width and height to render in, from the side; without, nothing is rendered.
-        frame_rate: about how many frames a second of the episode.
+        size: width and height of the frames; None renders nothing.
+        frame_rate: frames per second of simulated time, rounded to a divisor of the step rate.
 
     Raises:
-        UserError: it is to be rendered, and nothing here can.
+        UserError: frames are wanted, and this machine cannot render.
     """
-    rendering: dict[str, Any] = {}
-    if size:
-        choose_opengl()
-        rendering = {"render_mode": "rgb_array", "width": size[0], "height": size[1]}
-    env = make_gymnasium(task, **rendering)
+    env = make_gymnasium(task) if size is None else _make_rendered(task, *size)
     inner: Any = env.unwrapped
     model, data = inner.model, inner.data
-    if size:
-        inner.mujoco_renderer.default_cam_config = _CAMERA
-        inner.mujoco_renderer.camera_id = None  # which would stop it from following
-        _draw_larger_floor(model)
-        model.vis.quality.shadowsize = 1024  # of 4096, which costs a CPU a quarter of the time
     steps_per_frame = max(1, round(1.0 / (inner.dt * frame_rate)))
-    kept: dict[str, list[Any]] = {name: [] for name in ("qpos", "torso", "torques", "floor_contacts", "rewards")}
-    terms: list[dict[str, float]] = []
+    kept: defaultdict[str, list[Any]] = defaultdict(list)
+    terms: defaultdict[str, list[float]] = defaultdict(list)
     frames = []
     obs, _ = env.reset(seed=seed)
     is_over = False
@@ -98,18 +93,20 @@ def record_episode(
         is_over = terminated or truncated
         kept["qpos"].append(data.qpos.copy())
         kept["torso"].append(data.xpos[1].copy())
-        kept["torques"].append((data.actuator_force * model.actuator_gear[:, 0]).copy())
+        kept["torques"].append(data.actuator_force * model.actuator_gear[:, 0])
         kept["floor_contacts"].append(_floor_contacts(model, data))
         kept["rewards"].append(float(reward))
-        terms.append({name: float(value) for name, value in info.items() if name.startswith("reward_")})
-        if size and len(terms) % steps_per_frame == 1 % steps_per_frame:
+        for name in info:
+            if name.startswith("reward_"):
+                terms[name].append(float(info[name]))
+        if size and len(kept["rewards"]) % steps_per_frame == 1 % steps_per_frame:
             frames.append(np.asarray(env.render()))
     env.close()
     return Episode(
         env=task.gymnasium_id,
         model=model,
         seconds_per_step=inner.dt,
-        reward_terms={name: np.array([step[name] for step in terms]) for name in terms[0]},
+        reward_terms={name: np.array(values) for name, values in terms.items()},
         frames=frames,
         steps_per_frame=steps_per_frame,
         **{name: np.array(values) for name, values in kept.items()},
@@ -117,25 +114,32 @@ def record_episode(
 
 
 def make_gymnasium(task: Task, **keywords: Any) -> gymnasium.Env:
-    """The real environment that a task stands for, with further keywords of Gymnasium's."""
+    """Make the real Gymnasium environment of a task, with further keywords of `gymnasium.make`."""
     options = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # v4 is asked for knowingly
+        warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
         return gymnasium.make(task.gymnasium_id, **options, **keywords)
 
 
-def _draw_larger_floor(model: mujoco.MjModel, factor: float = 20.0) -> None:
-    """A plane is endless to touch, but drawn as large as it says; who runs fast has left it behind after 3 seconds."""
+def _make_rendered(task: Task, width: int, height: int) -> gymnasium.Env:
+    """Make the environment so that `render()` gives frames from the side, with the torso in the middle."""
+    choose_opengl()
+    env = make_gymnasium(task, render_mode="rgb_array", width=width, height=height)
+    inner: Any = env.unwrapped
+    model = inner.model
+    inner.mujoco_renderer.default_cam_config = _CAMERA
+    inner.mujoco_renderer.camera_id = None  # a camera id would stop the camera from following
     is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-    model.geom_size[is_plane, :2] *= factor
-    model.mat_texrepeat[model.geom_matid[is_plane]] *= factor
+    model.geom_size[is_plane, :2] *= _FLOOR_SCALE
+    model.mat_texrepeat[model.geom_matid[is_plane]] *= _FLOOR_SCALE
+    model.vis.quality.shadowsize = 1024  # MuJoCo's 4096 takes a quarter of the rendering time on a CPU
+    return env
 
 
 def _floor_contacts(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Which bodies touch a plane, `[nbody] bool`."""
+    """Whether each body touches a plane, `[nbody] bool`."""
     touches = np.zeros(model.nbody, bool)
     pairs = data.contact.geom[data.contact.dist <= 0.0]
     is_plane = model.geom_type[pairs] == mujoco.mjtGeom.mjGEOM_PLANE
-    for plane in (0, 1):
-        touches[model.geom_bodyid[pairs[is_plane[:, plane], 1 - plane]]] = True
+    touches[model.geom_bodyid[pairs[is_plane[:, ::-1]]]] = True
     return touches

@@ -1,4 +1,4 @@
-"""Films of a policy while it trains, beside its curves in TensorBoard, made by a process of its own on the CPU."""
+"""Films of a policy during training, as MP4 files and in TensorBoard; a child process on the CPU makes them."""
 
 import io
 import os
@@ -24,25 +24,25 @@ from mjx_walk.viewing.rendering import write_film
 _SIZE = (320, 240)
 _FRAMES_PER_SECOND = 25.0
 _SECONDS_IN_TENSORBOARD = 5.0
-_EVERY_NTH_FRAME = 2
-"""Is kept in TensorBoard, whose films are GIFs, and large."""
+_TENSORBOARD_FRAME_STRIDE = 2
+"""TensorBoard's films are GIFs, which are large, so they keep one frame in this many."""
 
 
 class Filmer:
-    """Takes one film at a time; what is evaluated meanwhile is not filmed."""
+    """Makes one film at a time; policies evaluated in the meantime are not filmed."""
 
     def __init__(self, config: Config, folder: RunFolder):
         """
         Args:
             config: of the run.
-            folder: of the run; films are put into its `films/`.
+            folder: of the run; its `films/` holds the films.
         """
         self._config = config
         self._folder = folder
         self._process: subprocess.Popen | None = None
 
     def take(self, policy_params: Any, env_steps: int) -> None:
-        """Begin a film of a policy, unless the last one is not finished."""
+        """Start to film a policy, unless the previous film is still being made."""
         if self._process and self._process.poll() is None:
             return
         film = RunFolder(self._folder.path / "films" / str(env_steps))
@@ -53,28 +53,31 @@ class Filmer:
         self._process = start_module("viewing.film", str(film.path), env={"JAX_PLATFORMS": "cpu"})
 
     def wait(self) -> None:
-        """Until the last film is finished."""
+        """Wait until the last film is finished."""
         if self._process:
             self._process.wait()
 
 
-def film(folder: Path) -> Path:
-    """Film the policy that lies in a folder of `films/`, which is named after its environment steps, and remove it."""
+def film(folder: Path) -> None:
+    """Film the policy saved in `films/ENV_STEPS`, and replace the folder with `films/ENV_STEPS.mp4`."""
     run = SavedPolicy(RunFolder(folder), "c")
     episode = record_episode(run.task, run.policy, size=_SIZE, frame_rate=_FRAMES_PER_SECOND)
-    path = folder.with_suffix(".mp4")
-    write_film(episode.frames, path, episode.frames_per_second)
-    shown = episode.frames[: round(_SECONDS_IN_TENSORBOARD * episode.frames_per_second) : _EVERY_NTH_FRAME]
-    _show_in_tensorboard(folder.parent.parent, int(folder.name), shown, episode.frames_per_second / _EVERY_NTH_FRAME)
+    write_film(episode.frames, folder.with_suffix(".mp4"), episode.frames_per_second)
+    num_shown = round(_SECONDS_IN_TENSORBOARD * episode.frames_per_second)
+    shown = np.stack(episode.frames[:num_shown:_TENSORBOARD_FRAME_STRIDE])
+    frames_per_second = episode.frames_per_second / _TENSORBOARD_FRAME_STRIDE
+    _add_to_tensorboard(folder.parent.parent, int(folder.name), shown, frames_per_second)
     shutil.rmtree(folder)
-    return path
 
 
-def _show_in_tensorboard(run_dir: Path, env_steps: int, frames: list[np.ndarray], frames_per_second: float) -> None:
-    """Not by `add_video`, which would need MoviePy to write the same GIF."""
+def _add_to_tensorboard(run_dir: Path, env_steps: int, frames: np.ndarray, frames_per_second: float) -> None:
+    """Add a GIF of frames, `[N, height, width, 3] u8`, to the run's events.
+
+    `add_video` would need MoviePy to write the same GIF.
+    """
     gif = io.BytesIO()
-    iio.imwrite(gif, np.stack(frames), extension=".gif", duration=1000.0 / frames_per_second, loop=0)
-    height, width = frames[0].shape[:2]
+    iio.imwrite(gif, frames, extension=".gif", duration=1000.0 / frames_per_second, loop=0)
+    _, height, width, _ = frames.shape
     image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=gif.getvalue())
     with SummaryWriter(str(run_dir), filename_suffix=f".film{env_steps}") as events:
         events.file_writer.add_summary(Summary(value=[Summary.Value(tag="film", image=image)]), env_steps)

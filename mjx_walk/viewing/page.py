@@ -1,4 +1,4 @@
-"""An episode as one page that plays it in 3D in any browser, offline."""
+"""A self-contained web page that plays an episode in 3D, in any browser and offline."""
 
 import base64
 import importlib.util
@@ -15,28 +15,22 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.episode import Episode
 
 _TEMPLATE = Path(__file__).with_name("page.html")
-_SHAPES = {
-    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
-    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
-    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
-    mujoco.mjtGeom.mjGEOM_BOX: "box",
-    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
-}
+_SHAPES = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
+"""Shapes that the page can draw."""
 _NUM_VISIBLE_GROUPS = 3
-"""MuJoCo's viewer shows geoms of the first three groups; the others are for collisions."""
+"""MuJoCo's viewer shows the geoms of the first three groups; models use the others for collisions."""
 
 
 def require_library() -> Path:
-    """The 3D library that goes into a page: MeshCat's viewer, which holds three.js.
+    """Path of the JavaScript library that a page embeds: MeshCat's viewer, which contains three.js.
 
     Raises:
-        UserError: it is not installed.
+        UserError: MeshCat is not installed.
     """
-    # Not imported: only its file is wanted.
+    # The page needs only this file, so MeshCat is not imported.
     package = importlib.util.find_spec("meshcat")
     if package is None or not package.submodule_search_locations:
-        raise UserError("html= needs MeshCat, whose 3D viewer goes into the page: pip install meshcat")
+        raise UserError("html= needs MeshCat, whose 3D viewer the page embeds: pip install meshcat")
     return Path(package.submodule_search_locations[0]) / "viewer" / "dist" / "main.min.js"
 
 
@@ -44,22 +38,21 @@ def write_page(episode: Episode, path: Path) -> Path:
     """Write the page, about 1.5 MB.
 
     Raises:
-        UserError: the 3D library is not installed.
+        UserError: MeshCat is not installed.
     """
-    seconds = f"{len(episode.rewards)} steps, {episode.seconds[-1]:.1f} s"
-    summary = f"return {episode.rewards.sum():,.0f} in {seconds}, in the real Gymnasium"
-    poses = _body_poses(episode)
+    model = episode.model
+    length = f"{len(episode.rewards)} steps, {episode.seconds[-1]:.1f} s"
     data = {
-        "summary": summary,
+        "summary": f"return {episode.rewards.sum():,.0f} in {length}, in the real Gymnasium",
         "num_steps": len(episode.rewards),
-        "num_bodies": episode.model.nbody,
+        "num_bodies": model.nbody,
         "seconds_per_step": episode.seconds_per_step,
         "eye_height": round(float(episode.torso[:, 2].max()) * 0.6, 3),
-        "geoms": _geoms(episode.model),
-        "floors": _floors(episode.model),
-        "poses": base64.b64encode(poses.astype("<f4").tobytes()).decode(),
-        "returns": [round(float(value), 2) for value in np.cumsum(episode.rewards)],
-        "series": {name: [round(float(v), 4) for v in values] for name, values in episode.reward_terms.items()},
+        "geoms": _geoms(model),
+        "floors": _rounded(model.geom_pos[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, 2]),
+        "poses": base64.b64encode(_body_poses(episode).astype("<f4").tobytes()).decode(),
+        "returns": _rounded(np.cumsum(episode.rewards), 2),
+        "series": {name: _rounded(values, 4) for name, values in episode.reward_terms.items()},
     }
     page = string.Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
         title=episode.env,
@@ -71,12 +64,12 @@ def write_page(episode: Episode, path: Path) -> Path:
 
 
 def _inside_script(text: str) -> str:
-    """The same text, JavaScript or JSON, without what would end the element around it."""
+    """Escape JavaScript or JSON so that it cannot close the `<script>` element around it."""
     return re.sub("</(?=script)", r"<\\/", text, flags=re.IGNORECASE)
 
 
 def _body_poses(episode: Episode) -> np.ndarray:
-    """Position, and rotation as three.js wants it (x, y, z, w), of every body after every step, `[T, nbody, 7]`."""
+    """Position and quaternion of every body after every step, `[T, nbody, 7]`; three.js orders it x, y, z, w."""
     model = episode.model
     data = mujoco.MjData(model)
     poses = np.zeros((len(episode.qpos), model.nbody, 7))
@@ -89,12 +82,12 @@ def _body_poses(episode: Episode) -> np.ndarray:
 
 
 def _geoms(model: mujoco.MjModel) -> list[dict[str, Any]]:
-    """Those that are seen and that the page can draw: not planes, height fields and signed distance functions."""
+    """The visible geoms, without planes, height fields and signed distance functions."""
     geoms = []
     for i in range(model.ngeom):
-        shape = _SHAPES.get(mujoco.mjtGeom(model.geom_type[i]))
+        shape = mujoco.mjtGeom(model.geom_type[i]).name.removeprefix("mjGEOM_").lower()
         rgba = model.mat_rgba[model.geom_matid[i]] if model.geom_matid[i] >= 0 else model.geom_rgba[i]
-        if shape is None or model.geom_group[i] >= _NUM_VISIBLE_GROUPS or rgba[3] == 0:
+        if shape not in _SHAPES or model.geom_group[i] >= _NUM_VISIBLE_GROUPS or rgba[3] == 0:
             continue
         geom = {
             "type": shape,
@@ -109,19 +102,14 @@ def _geoms(model: mujoco.MjModel) -> list[dict[str, Any]]:
 
 
 def _mesh(model: mujoco.MjModel, mesh: int) -> dict[str, list]:
-    """Its corners, three numbers each, and its triangles, three corners each."""
-    corners = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
-    triangles = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
+    """Vertices of a mesh, three numbers each, and its triangles, three vertex indices each."""
+    vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
+    faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
     return {
-        "vertices": _rounded(model.mesh_vert[corners].ravel()),
-        "faces": model.mesh_face[triangles].ravel().tolist(),
+        "vertices": _rounded(model.mesh_vert[vertices].ravel()),
+        "faces": model.mesh_face[faces].ravel().tolist(),
     }
 
 
-def _floors(model: mujoco.MjModel) -> list[float]:
-    """The height of each plane, m."""
-    return _rounded(model.geom_pos[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, 2])
-
-
-def _rounded(values: np.ndarray) -> list[float]:
-    return [round(float(value), 5) for value in values]
+def _rounded(values: np.ndarray, digits: int = 5) -> list[float]:
+    return [round(float(value), digits) for value in values]

@@ -1,13 +1,13 @@
-"""Rendering without a screen: which OpenGL, and films."""
+"""Rendering without a screen: the choice of OpenGL, and film files."""
 
 import os
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
-import imageio_ffmpeg
+import imageio.v3 as iio
 import numpy as np
 
 from mjx_walk.utils.errors import UserError
@@ -16,22 +16,19 @@ _PROBE = "import mujoco; mujoco.GLContext(64, 64).make_current()"
 
 
 def choose_opengl() -> None:
-    """Let MuJoCo render without a screen on Linux, by EGL or else by OSMesa; elsewhere its own choice is the right one.
+    """Set `MUJOCO_GL` so that MuJoCo renders without a screen on Linux: EGL if it works, else OSMesa.
 
-    A `MUJOCO_GL` that is set already stays.
+    A `MUJOCO_GL` that the user has set stays. Other systems need no setting.
 
     Raises:
-        UserError: neither works here.
+        UserError: neither works on this machine.
     """
     if "MUJOCO_GL" in os.environ or sys.platform != "linux":
         return
     for name in ("egl", "osmesa"):
-        # In a process of its own, since a broken driver may take the whole process down.
-        probe = [sys.executable, "-c", _PROBE]
-        if (
-            subprocess.run(probe, env=os.environ | {"MUJOCO_GL": name}, capture_output=True, check=False).returncode
-            == 0
-        ):
+        # A broken driver may crash the process, so each probe runs in its own.
+        env = os.environ | {"MUJOCO_GL": name}
+        if not subprocess.run([sys.executable, "-c", _PROBE], env=env, capture_output=True, check=False).returncode:
             os.environ["MUJOCO_GL"] = name
             return
     raise UserError(
@@ -40,23 +37,18 @@ def choose_opengl() -> None:
     )
 
 
-def write_film(frames: Iterable[np.ndarray], path: Path, frames_per_second: float) -> None:
+def write_film(frames: list[np.ndarray], path: Path, frames_per_second: float) -> None:
     """Write an MP4 (H.264).
 
     Args:
-        frames: `[height, width, 3] u8` each, all of one size, which is cut to even numbers.
+        frames: `[height, width, 3] u8` each, all of one size. An odd size is cut to an even one.
         path: of the file.
         frames_per_second: of the film.
     """
-    frames = iter(frames)
-    first = next(frames)
-    height, width = (size // 2 * 2 for size in first.shape[:2])
-    writer = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=frames_per_second, quality=7, macro_block_size=2, ffmpeg_log_level="error"
-    )
+    height, width = (size // 2 * 2 for size in frames[0].shape[:2])
+    even = [frame[:height, :width] for frame in frames]
+    options: dict[str, Any] = {"quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # that JAX has threads, which starting ffmpeg does not copy
-        writer.send(None)
-    for frame in (first, *frames):
-        writer.send(np.ascontiguousarray(frame[:height, :width]))
-    writer.close()
+        # Starting ffmpeg forks, and Python warns of a fork in a process with threads; JAX has some.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        iio.imwrite(path, even, plugin="FFMPEG", fps=frames_per_second, **options)

@@ -1,4 +1,4 @@
-"""A policy in MuJoCo's own live viewer."""
+"""MuJoCo's live viewer, driven by a policy."""
 
 import sys
 import time
@@ -13,21 +13,21 @@ from mjx_walk.viewing.episode import make_gymnasium
 
 
 def show(task: Task, policy: Callable[[np.ndarray], np.ndarray], seed: int = 0) -> None:
-    """Play episodes in real time, one after the other, until the window is closed.
+    """Play episodes in real time until the user closes the window.
 
     Args:
-        task: says which environment, with which keywords.
+        task: the environment and its keywords.
         policy: `[observation_size] → [action_size]`, both in Gymnasium's units.
-        seed: of the first episode.
+        seed: of the first episode; each further episode adds one.
 
     Raises:
-        UserError: there is no screen, or macOS wants another interpreter.
+        UserError: there is no screen, or macOS needs `mjpython`.
     """
     import glfw
     import mujoco.viewer
 
     if not glfw.init():
-        raise UserError("viewer=true needs a screen; leave it out to get a film instead")
+        raise UserError("viewer=true needs a screen; leave it out to write a film instead")
     env = make_gymnasium(task)
     inner: Any = env.unwrapped
     try:
@@ -38,14 +38,14 @@ def show(task: Task, policy: Callable[[np.ndarray], np.ndarray], seed: int = 0) 
     with window:
         window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         window.cam.trackbodyid, window.cam.distance = 1, 4.0
+        is_over = True
         while window.is_running():
-            obs, _ = env.reset(seed=seed)
-            seed += 1
-            is_over = False
-            while window.is_running() and not is_over:
-                began = time.perf_counter()
-                obs, _, terminated, truncated, _ = env.step(policy(obs))
-                is_over = terminated or truncated
-                window.sync()
-                time.sleep(max(0.0, inner.dt - (time.perf_counter() - began)))
+            if is_over:
+                obs, _ = env.reset(seed=seed)
+                seed += 1
+            started = time.perf_counter()
+            obs, _, terminated, truncated, _ = env.step(policy(obs))
+            is_over = terminated or truncated
+            window.sync()
+            time.sleep(max(0.0, inner.dt - (time.perf_counter() - started)))
     env.close()

@@ -1,4 +1,4 @@
-"""`python -m mjx_walk.zoo`: list the policies that come with the package; for its authors: put a run's among them."""
+"""`python -m mjx_walk.zoo`: list the policies that the package ships, or add a run's policy to them."""
 
 import dataclasses
 import re
@@ -10,13 +10,12 @@ from mjx_walk import zoo
 from mjx_walk.api import load_run
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import save_config, training_command
-from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
 
 USAGE = """
 usage: python -m mjx_walk.zoo                          list the policies
-       python -m mjx_walk.zoo add=RUN_DIR name=NAME    score a run's policy and put it there
+       python -m mjx_walk.zoo add=RUN_DIR name=NAME    score a run's policy and add it; for the package's authors
 """
 
 
@@ -26,21 +25,20 @@ class Arguments:
     name: str | None = None
 
 
-def main(arguments: list[str]) -> None:
-    """List, or add."""
-    parsed = cli.parse(Arguments, arguments, USAGE)
-    if parsed.add is None:
+def main(command_line: list[str]) -> None:
+    """List the policies, or add one."""
+    arguments = cli.parse(Arguments, command_line, USAGE)
+    if arguments.add is None:
         print(zoo.table())
         return
-    if parsed.name is None:
+    if arguments.name is None:
         raise UserError("say under which name: name=humanoid-ppo")
-    if not re.fullmatch(r"[\w-]+", parsed.name):
-        raise UserError(f"name={parsed.name}: letters, digits, '_' and '-' make a name")
-    source = zoo.open_run(parsed.add)
-    run = load_run(source.path, "auto")
+    if not re.fullmatch(r"[\w-]+", arguments.name):
+        raise UserError(f"name={arguments.name}: use only letters, digits, '_' and '-'")
+    run = load_run(arguments.add, "auto")
     run.policy_params = _rounded_to(run.config.algo.network_dtype, run.policy_params)
     scores = run.evaluate()
-    folder = RunFolder(zoo.empty_folder(parsed.name))
+    folder = zoo.empty_folder(arguments.name)
     config = dataclasses.replace(run.config, physics="auto", run_dir=None, resume=False)
     save_config(config, folder.config)
     facts = {"env_steps": run.policy_facts["env_steps"]}
@@ -50,7 +48,7 @@ def main(arguments: list[str]) -> None:
 
 
 def _rounded_to(dtype: str, policy_params: Any) -> Any:
-    """A policy with weights of the precision that its networks learned with: half the bytes of bfloat16 are zeros."""
+    """Round weights to the precision that the networks learned with; the zeros of bfloat16 compress well."""
     normalizer, params = policy_params
     return normalizer, jax.tree.map(lambda x: x.astype(dtype).astype(x.dtype), params)
 

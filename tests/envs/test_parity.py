@@ -1,4 +1,4 @@
-"""The MJX engines against MuJoCo's C library, one step at a time; the tolerances are `mjx_walk.parity`'s."""
+"""The MJX engines against MuJoCo's C library, one step at a time; the tolerances are `mjx_walk.evaluation.parity`'s."""
 
 import jax
 import jax.numpy as jnp
@@ -6,9 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_walk import parity
 from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.physics import PhysicsState, make_engine, mjx_warp
+from mjx_walk.evaluation import parity
+from mjx_walk.utils.compat import prepare_jax
+
+prepare_jax()  # before any test of this process starts JAX
 
 CASES = [(name, "v5", "warp") for name in TASKS]
 CASES += [("humanoid", "v4", "warp"), ("walker2d", "v5", "jax")]
@@ -51,7 +54,7 @@ def test_a_steep_capsule_slides_as_in_c(physics, tilt):
 
 
 def test_the_compiler_reduces_a_large_batch_right():
-    """The premise of every other test here; without the flag of `xla_flags`, JAX 0.10.2 fails it on a CPU."""
+    """The premise of every other test here; without the flag of `prepare_jax`, jaxlib 0.10.2 fails it on a CPU."""
     rows = jnp.zeros((40_000, 3)).at[:, 0].set(jnp.arange(40_000.0))
     found = jax.jit(jax.vmap(lambda row: jnp.sum((jnp.eye(3) @ row) ** 2)))(rows)
     np.testing.assert_allclose(found, np.arange(40_000.0) ** 2, rtol=1e-6)

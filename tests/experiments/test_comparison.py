@@ -41,7 +41,7 @@ def test_variants_are_the_product_of_algorithms_swept_values_and_seeds(tmp_path)
     overrides = ["env=walker2d", "algo.discount=0.9,0.95", "total_steps=1000"]
     out, planned = planned_runs.plan(overrides, ["ppo", "a2c"], [0, 7], str(tmp_path / "a b's"), "cpu")
     assert out == tmp_path / "a b's"
-    assert [cell.name for cell in planned] == [
+    assert [run.name for run in planned] == [
         f"{algo}_discount-{discount}/seed_{seed}"
         for seed in (0, 7)
         for algo in ("ppo", "a2c")
@@ -50,8 +50,8 @@ def test_variants_are_the_product_of_algorithms_swept_values_and_seeds(tmp_path)
     last = planned[-1].config
     assert (last.algo.name, last.algo.discount, last.seed, last.total_steps) == ("a2c", 0.95, 7, 1000)
     assert last.run_dir == str(tmp_path / "a b's" / "a2c_discount-0.95" / "seed_7")
-    copies = [cell.config.num_envs for cell in planned[:4]]
-    assert copies == [64, 64, 256, 256]  # each with its own recipe
+    num_envs = [run.config.num_envs for run in planned[:4]]
+    assert num_envs == [64, 64, 256, 256]  # each with its own recipe
 
 
 def test_what_is_named_twice_is_run_once(tmp_path):
@@ -61,7 +61,7 @@ def test_what_is_named_twice_is_run_once(tmp_path):
 def test_variants_have_folders_of_their_own(tmp_path):
     def variants(sweep):
         planned = planned_runs.plan(["env=walker2d", sweep], ["sac"], [0], str(tmp_path), "cpu")[1]
-        return [cell.variant for cell in planned]
+        return [run.variant for run in planned]
 
     assert variants("algo.target_entropy=-0.5,0.5") == ["sac_target_entropy--0.5", "sac_target_entropy-0.5"]
     assert variants("algo.policy_hidden_layer_sizes=[32,32],[32,64]") == [
@@ -91,8 +91,8 @@ def test_runs_are_grouped_by_what_sets_them_apart(tmp_path):
         "ppo, discount=0.5": 2,
     }
     text = report.write_report(tmp_path).read_text()
-    assert "| ppo, discount=0.99 | 2 | 15 | 7 | – | 10 | 3.00 | 30 |" in text
-    assert "| ppo, discount=0.5 | 0 of 2 scored | – | – | – | – | 2.00 | 20 |" in text
+    assert "| ppo, discount=0.99 | 2 | 15 | 7 | – | 10 | 3.00 | 30 | 1 |" in text
+    assert "| ppo, discount=0.5 | 0 of 2 scored | – | – | – | – | 2.00 | 20 | 1 |" in text
     rows = list(csv.DictReader((tmp_path / "comparison.csv").open()))
     assert len(rows) == 6 and {row["gymnasium_mean"] for row in rows} == {"10.0", "20.0", ""}
     assert (tmp_path / "comparison.png").read_bytes()[:4] == b"\x89PNG"
@@ -140,11 +140,11 @@ def test_compare_runs_what_is_missing_and_keeps_the_rest(tmp_path, monkeypatch, 
     arguments = ("seeds=1", "out=out", *SMALL)
     assert command_here("compare", "algos=[ppo]", *arguments) == 0
     printed = capfd.readouterr().out
-    assert "1 runs, 0 of them finished before" in printed and "| ppo | 1 |" in printed
+    assert "1 runs in out, 0 of them finished already" in printed and "| ppo | 1 |" in printed
     before = (tmp_path / "out" / "ppo" / "seed_0" / "metrics.jsonl").stat().st_mtime_ns
     assert command_here("compare", "algos=[ppo,a2c]", *arguments) == 0
     printed = capfd.readouterr().out
-    assert "2 runs, 1 of them finished before" in printed and "| a2c | 1 |" in printed
+    assert "2 runs in out, 1 of them finished already" in printed and "| a2c | 1 |" in printed
     assert (tmp_path / "out" / "ppo" / "seed_0" / "metrics.jsonl").stat().st_mtime_ns == before
 
 
@@ -162,7 +162,7 @@ def test_an_interrupted_comparison_goes_on(tmp_path):
         time.sleep(0.2)
     process.send_signal(signal.SIGINT)
     out, _ = process.communicate(timeout=60)
-    assert process.returncode == 130 and "the same command goes on" in out
+    assert process.returncode == 130 and "Run the same command to resume" in out
     steps = len((run / "metrics.jsonl").read_text().splitlines())
     assert 0 < steps < 100
     done = command("compare", *arguments, cwd=tmp_path)
@@ -220,7 +220,7 @@ def test_seeds_that_stand_at_the_same_step_are_trained_together(tmp_path):
     (tmp_path / "ppo" / "seed_1" / "checkpoints" / "4096").mkdir(parents=True)
 
     def names(together):
-        return [[cell.name for cell in job] for job in planned_runs.jobs(planned, together)]
+        return [[run.name for run in job] for job in planned_runs.jobs(planned, together)]
 
     assert names(3) == [["ppo/seed_0", "ppo/seed_2"], ["a2c/seed_0", "a2c/seed_1", "a2c/seed_2"], ["ppo/seed_1"]]
     assert names(2)[1:] == [["a2c/seed_0", "a2c/seed_1"], ["ppo/seed_1"], ["a2c/seed_2"]]
@@ -248,16 +248,16 @@ def test_no_run_goes_on_alone(tmp_path, monkeypatch):
     """One of two runs ends, and what is to be done then fails."""
     _, planned = planned_runs.plan(["env=walker2d"], ["ppo"], [0, 1], str(tmp_path), "cpu")
     processes = [FakeProcess(code=0), FakeProcess()]
-    monkeypatch.setattr(planned_runs, "start", lambda job, *_: processes[job[0].config.seed])
+    monkeypatch.setattr(planned_runs, "start_job", lambda job, *_: processes[job[0].config.seed])
     with pytest.raises(ZeroDivisionError):
-        planned_runs.run(planned_runs.jobs(planned, 1), [0, 1], tmp_path / "logs", lambda cell, log: 1 // 0)
+        planned_runs.run_jobs(planned_runs.jobs(planned, 1), [0, 1], tmp_path / "logs", lambda run, log: 1 // 0)
     assert processes[1].signals == [signal.SIGTERM]
 
 
 def test_a_second_comparison_in_the_same_folder_waits_its_turn(tmp_path):
-    with planned_runs._only_one_at_a_time(tmp_path / "out" / "logs"), pytest.raises(UserError, match="still going on"):
-        planned_runs.run([], [None], tmp_path / "out" / "logs", lambda cell, log: None)
-    assert planned_runs.run([], [None], tmp_path / "out" / "logs", lambda cell, log: None) is None
+    with planned_runs._lock(tmp_path / "out" / "logs"), pytest.raises(UserError, match="still being trained"):
+        planned_runs.run_jobs([], [None], tmp_path / "out" / "logs", lambda run, log: None)
+    assert planned_runs.run_jobs([], [None], tmp_path / "out" / "logs", lambda run, log: None) is None
 
 
 def test_a_run_that_fails_is_named(tmp_path, monkeypatch, capfd):
@@ -284,8 +284,8 @@ def test_each_run_sees_its_own_gpu(tmp_path, monkeypatch, visible, expected):
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     started = []
     monkeypatch.setattr(subprocess, "Popen", lambda arguments, **kwargs: started.append((arguments, kwargs["env"])))
-    _, (cell,) = planned_runs.plan(["env=walker2d"], ["ppo"], [3], str(tmp_path), "gpu")
-    planned_runs.start([cell], tmp_path / "logs" / "cell.txt", 1, 2, 0)
+    _, (run,) = planned_runs.plan(["env=walker2d"], ["ppo"], [3], str(tmp_path), "gpu")
+    planned_runs.start_job([run], tmp_path / "logs" / "run.txt", 1, 2, 0)
     ((arguments, environment),) = started
     assert environment["CUDA_VISIBLE_DEVICES"] == expected
     assert float(environment["XLA_PYTHON_CLIENT_MEM_FRACTION"]) <= 0.75 / 2 + 0.01

@@ -130,5 +130,5 @@ def test_a_browser_plays_it(tmp_path, episode):
 
 def test_without_the_library_there_is_one_line(monkeypatch):
     monkeypatch.setattr(page.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(UserError, match="html= needs MeshCat, whose 3D viewer goes into the page"):
+    with pytest.raises(UserError, match="html= needs MeshCat, whose 3D viewer the page embeds"):
         page.require_library()

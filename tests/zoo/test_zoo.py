@@ -9,7 +9,6 @@ from helpers import command, command_here
 import mjx_walk
 from mjx_walk import zoo
 from mjx_walk.runs.config import flatten, load_config, read_config, training_command
-from mjx_walk.runs.run_folder import open_existing
 
 NAMES = zoo.names()
 
@@ -21,7 +20,7 @@ def test_three_tasks_and_the_main_algorithms_are_there():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_policy_is_small_and_scores_about_what_it_did(name):
-    folder = open_existing(f"zoo:{name}")
+    folder = zoo.open_run(f"zoo:{name}")
     assert sum(path.stat().st_size for path in folder.path.rglob("*") if path.is_file()) < 1_000_000
     facts = json.loads(folder.gymnasium_scores.read_text())
     assert len(facts["returns"]) == 100 and np.mean(facts["returns"]) == pytest.approx(facts["mean"])
@@ -31,7 +30,7 @@ def test_a_policy_is_small_and_scores_about_what_it_did(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_its_command_gives_its_settings(name):
-    folder = open_existing(f"zoo:{name}")
+    folder = zoo.open_run(f"zoo:{name}")
     config = read_config(folder.config)
     command = json.loads(folder.gymnasium_scores.read_text())["command"]
     assert command == training_command(config)
@@ -43,10 +42,10 @@ def test_its_command_gives_its_settings(name):
 
 
 def test_scoring_one_does_not_write_into_the_package(capsys):
-    before = (open_existing("zoo:walker2d-sac").gymnasium_scores).read_bytes()
+    before = zoo.open_run("zoo:walker2d-sac").gymnasium_scores.read_bytes()
     assert command_here("eval", "run=zoo:walker2d-sac", "episodes=1") == 0
     assert "Walker2d-v5: 7," in capsys.readouterr().out
-    assert (open_existing("zoo:walker2d-sac").gymnasium_scores).read_bytes() == before
+    assert zoo.open_run("zoo:walker2d-sac").gymnasium_scores.read_bytes() == before
 
 
 def test_the_table_and_an_unknown_name(capsys):
@@ -54,7 +53,7 @@ def test_the_table_and_an_unknown_name(capsys):
     assert done.returncode == 0 and done.stdout.count("python -m mjx_walk.train") == len(NAMES), done.stderr
     for name in ("", "../elsewhere", "/elsewhere"):
         assert command_here("zoo", "add=zoo:walker2d-sac", f"name={name}") == 2
-        assert "letters, digits, '_' and '-' make a name" in capsys.readouterr().err
+        assert "use only letters, digits, '_' and '-'" in capsys.readouterr().err
     assert zoo.names() == NAMES
     assert command_here("eval", "run=zoo:humanoid-dqn") == 2
     assert "no policy 'humanoid-dqn' in the zoo; choose one of: " in capsys.readouterr().err
