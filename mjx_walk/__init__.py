@@ -1,4 +1,7 @@
-"""mjx_walk: train simulated bodies to walk on the exact Gymnasium tasks, end to end on the device."""
+"""mjx_walk: train simulated bodies to walk on the exact Gymnasium tasks, entirely on the device.
+
+Importing the package registers the tasks with Gymnasium and does nothing else.
+"""
 
 import importlib
 from typing import TYPE_CHECKING, Any
@@ -24,7 +27,7 @@ _WHERE = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import JAX and MuJoCo only when something that needs them is used."""
+    """Import JAX and MuJoCo at the first use of a name that needs them."""
     if name in _WHERE:
         return getattr(importlib.import_module(_WHERE[name]), name)
     raise AttributeError(f"module 'mjx_walk' has no attribute '{name}'")

@@ -1,9 +1,9 @@
-"""What the commands, the notebook and the tests call: train a run, load a run."""
+"""The Python API, which the commands use as well: train a run, load a run."""
 
 import dataclasses
 import functools
+import logging
 import operator
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,11 @@ import jax
 
 from mjx_walk import zoo
 from mjx_walk.algos import make_algorithm
+from mjx_walk.envs import Task
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.evaluation.gymnasium_scores import Scores, score_in_gymnasium, score_in_sim
 from mjx_walk.runs import run_folder
-from mjx_walk.runs.config import Config, compile_cache_dir, load_config, present_key, read_config
+from mjx_walk.runs.config import Config, load_config, present_key, read_config
 from mjx_walk.runs.loggers import require_wandb
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.policies import SavedPolicy, make_task
@@ -23,13 +24,18 @@ from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.memory_check import check_replay
 from mjx_walk.training.trainer import Trainer
+from mjx_walk.utils.compat import prepare_jax, temporary_jax_settings
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.signals import as_by_ctrl_c
 from mjx_walk.viewing.rendering import choose_opengl
 
+__all__ = ["Run", "load_run", "resolve", "resolve_seeds", "run", "train"]
+
+_LOGGER = logging.getLogger(__name__)
+
 
 class Run(SavedPolicy):
-    """A run on disk: its configuration, its metrics and its best policy."""
+    """A run on disk: its configuration, metrics and best policy."""
 
     @functools.cached_property
     def metrics(self) -> list[Row]:
@@ -37,7 +43,13 @@ class Run(SavedPolicy):
         return read_rows(self.path / "metrics.jsonl")
 
     def evaluate(self, episodes: int = 100, backend: str = "gymnasium", seed: int = 0) -> Scores:
-        """Score the policy without noise; `backend` is `gymnasium` or `sim`, the run's own engine."""
+        """Score the deterministic policy.
+
+        Args:
+            episodes: number of episodes.
+            backend: `gymnasium`, the real environment, or `sim`, the engine that the run was loaded with.
+            seed: seed of the resets.
+        """
         if backend == "gymnasium":
             return score_in_gymnasium(self.task, self.act, episodes, seed)
         policy = self.algorithm.policy(self.policy_params, deterministic=True)
@@ -45,28 +57,33 @@ class Run(SavedPolicy):
 
 
 def load_run(path: str | Path, physics: str | None = None) -> Run:
-    """Load a run from its folder.
+    """Load a run.
+
+    Args:
+        path: its folder, or `zoo:NAME`.
+        physics: engine to use instead of the run's own.
 
     Raises:
-        UserError: no run, or no usable policy there.
+        UserError: no run, or no usable policy at that path.
     """
+    prepare_jax()
     return Run(zoo.open_run(path), physics)
 
 
 def resolve(overrides: list[str]) -> Config:
-    """The configuration that a command line asks for. `resume=true` with nothing but the folder takes the run's own.
+    """The configuration of a command line. `resume=true` with only a folder continues with the saved configuration.
 
     Raises:
-        UserError: anything wrong in it.
+        UserError: invalid overrides.
     """
     return _as_saved(load_config(overrides), overrides)
 
 
 def resolve_seeds(overrides: list[str], seeds: list[int]) -> list[Config]:
-    """The same for several seeds, each in a folder `seed_N` of `run_dir`.
+    """The configurations of a command line for several seeds, each with the folder `seed_N` in `run_dir`.
 
     Raises:
-        UserError: anything wrong in it.
+        UserError: invalid overrides.
     """
     if any(override.startswith("seed=") for override in overrides):
         raise UserError("give seed=N or seeds=[…], not both")
@@ -81,74 +98,92 @@ def resolve_seeds(overrides: list[str], seeds: list[int]) -> list[Config]:
 def train(
     configs: list[Config], on_metrics: Callable[[Row], None] | None = None, processes: Processes | None = None
 ) -> tuple[list[RunFolder], str | None]:
-    """Train one run, or several that differ in their seed alone side by side; then score them in the real Gymnasium.
+    """Train one run, or several that differ only in their seed, and score them in the real Gymnasium.
+
+    JAX's settings are restored at the end.
 
     Args:
-        configs: checked configurations, alike but for `seed` and `run_dir`.
-        on_metrics: called with every row that is logged.
-        processes: that train one run together; this is one of them.
+        configs: checked configurations, equal except for `seed` and `run_dir`.
+        on_metrics: called with every logged row.
+        processes: the processes that train one run together, including this one.
 
     Returns:
-        The run folders, and the name of the signal that stopped them early, if one did.
+        The run folders, and the name of the signal that stopped training early, if one did.
+
+    Raises:
+        UserError: the run does not fit this machine, or a folder or its run does not fit the configuration.
     """
     require_wandb(configs[0])
     if configs[0].evaluation.films:
         choose_opengl()
     physics = resolve_engine(configs[0].physics)
     configs = [dataclasses.replace(config, physics=physics) for config in configs]
-    jax.config.update("jax_default_matmul_precision", configs[0].matmul_precision)
-    jax.config.update("jax_compilation_cache_dir", compile_cache_dir())
-    task = make_task(configs[0])
-    # Refuses what does not fit before a folder is made.
+    processes = processes or Processes()
+    with temporary_jax_settings(configs[0].matmul_precision):
+        task = make_task(configs[0])
+        folders, configs = _prepare(configs, task, processes)
+        trainer = Trainer(configs, task, folders, on_metrics, processes)
+        with as_by_ctrl_c():
+            signal_name = trainer.train()
+            if not signal_name:
+                _score(trainer, folders)
+            elif processes.is_main_process:
+                _LOGGER.info("Stopped by %s and saved. To continue: %s", signal_name, _resume_command(configs, folders))
+    return folders, signal_name
+
+
+def _prepare(configs: list[Config], task: Task, processes: Processes) -> tuple[list[RunFolder], list[Config]]:
+    """Check that the runs fit this machine, and prepare their folders. All processes get the main one's folder."""
     algorithm = make_algorithm(task, configs[0].num_envs, configs[0].evaluation, configs[0].algo)
     replay = check_replay(algorithm, Path(configs[0].run_dir or "."), len(configs))
-    processes = processes or Processes()
+    folders: list[RunFolder] = []
     if processes.is_main_process:
         folders, configs = run_folder.prepare(configs)
         _announce(configs[0], folders, processes.process_count)
         if replay:
-            print(replay, flush=True)
+            _LOGGER.info(replay)
     if processes.process_count > 1:
-        path = str(folders[0].path.absolute()) if processes.is_main_process else ""
+        path = str(folders[0].path.absolute()) if folders else ""
         folders = [RunFolder(Path(processes.broadcast_one_to_all(path)))]
-    trainer = Trainer(configs, task, folders, on_metrics, processes)
-    with as_by_ctrl_c():
-        signal_name = trainer.train()
-        if signal_name and processes.is_main_process:
-            where = f"run_dir={folders[0].path}"
-            if len(folders) > 1:
-                where = f"run_dir={folders[0].path.parent} 'seeds={[config.seed for config in configs]}'"
-            print(
-                f"Stopped by {signal_name} and saved. To go on: python -m mjx_walk.train {where} resume=true",
-                flush=True,
-            )
-        elif not signal_name:
-            try:
-                trainer.score()
-            except KeyboardInterrupt:
-                for folder in folders:
-                    if not folder.gymnasium_scores.exists():
-                        print(f"Trained and saved, not scored. To score: python -m mjx_walk.eval run={folder.path}")
-                raise
-    return folders, signal_name
+    return folders, configs
+
+
+def _score(trainer: Trainer, folders: list[RunFolder]) -> None:
+    try:
+        trainer.score()
+    except KeyboardInterrupt:
+        for folder in folders:
+            if not folder.gymnasium_scores.exists():
+                _LOGGER.info("Trained and saved, not scored. To score: python -m mjx_walk.eval run=%s", folder.path)
+        raise
+
+
+def _resume_command(configs: list[Config], folders: list[RunFolder]) -> str:
+    where = f"run_dir={folders[0].path}"
+    if len(folders) > 1:
+        where = f"run_dir={folders[0].path.parent} 'seeds={[config.seed for config in configs]}'"
+    return f"python -m mjx_walk.train {where} resume=true"
 
 
 def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | None = None) -> Run:
-    """Train as `python -m mjx_walk.train` would, from Python.
+    """Train as `python -m mjx_walk.train` does, from Python.
+
+    Messages and progress go to the logger `mjx_walk`, at level INFO.
 
     Args:
-        overrides: `["env=walker2d", "total_steps=1_000_000"]`.
-        on_metrics: called with every row that is logged.
+        overrides: arguments of the command, such as `["env=walker2d", "total_steps=1_000_000"]`.
+        on_metrics: called with every logged row.
 
     Raises:
-        UserError: anything wrong in the overrides.
+        UserError: invalid overrides, or a run that cannot be trained here.
     """
+    prepare_jax()
     folders, _ = train([resolve(overrides or [])], on_metrics)
     return load_run(folders[0].path)
 
 
 def _as_saved(config: Config, overrides: list[str]) -> Config:
-    """A run's own configuration, with the settings that were given to resume it, unless those say which run it is."""
+    """The saved configuration with the given settings, if a run is resumed without naming its task or algorithm."""
     given = {present_key(override.partition("=")[0]) for override in overrides}
     if not (config.resume and config.run_dir) or given & {"env", "algo", "recipe"}:
         return config
@@ -159,30 +194,32 @@ def _as_saved(config: Config, overrides: list[str]) -> Config:
 
 
 def _with_setting(settings: Any, key: str, value: Any) -> Any:
-    """The same dataclass with another value at a key such as `evaluation.films`."""
+    """Replace a value of nested dataclasses by its key, such as `evaluation.films`."""
     name, _, rest = key.partition(".")
     own = _with_setting(getattr(settings, name), rest, value) if rest else value
     return dataclasses.replace(settings, **{name: own})
 
 
 def _announce(config: Config, folders: list[RunFolder], num_devices: int) -> None:
+    """Log what is trained where, and what may surprise the user."""
     device = jax.devices()[0]
     where = device.device_kind if device.platform != "cpu" else "the CPU"
-    where = where if num_devices == 1 else f"{num_devices} × {where}, a process each"
+    where = where if num_devices == 1 else f"{num_devices} × {where}, one process each"
     path = folders[0].path if len(folders) == 1 else f"{len(folders)} folders of {folders[0].path.parent}"
-    print(f"Training {config.env.name} with {config.algo.name} on {where}, physics={config.physics}, in {path}")
+    env, algo = config.env.name, config.algo
+    _LOGGER.info("Training %s with %s on %s, physics=%s, in %s", env, algo.name, where, config.physics, path)
     if config.hardware == "cpu":
-        print(
-            "No accelerator: the CPU-sized recipe, with MuJoCo's C library unless another engine was asked for. "
-            "Expect minutes to tens of minutes to a gait; recipes for a GPU reach much higher scores.",
+        _LOGGER.info(
+            "No accelerator: this is the recipe for a CPU. By default the physics is MuJoCo's C library. "
+            "Expect a gait after minutes to tens of minutes; recipes for a GPU reach much higher scores."
         )
-    algo = config.algo
     if algo.learning_rate_schedule != "constant" and config.total_steps > algo.schedule_steps:
-        print(
-            f"warning: from algo.schedule_steps={algo.schedule_steps} on the learning rate is zero; to learn until "
-            f"total_steps={config.total_steps} give algo.schedule_steps={config.total_steps}, too",
-            file=sys.stderr,
+        _LOGGER.warning(
+            "after algo.schedule_steps=%d the learning rate is zero; to learn until total_steps=%d, "
+            "add algo.schedule_steps=%d",
+            algo.schedule_steps,
+            config.total_steps,
+            config.total_steps,
         )
     if config.physics == "warp":
-        print("Warp compiles its kernels on the first run of a machine, which takes about a minute.")
-    sys.stdout.flush()
+        _LOGGER.info("On the first run on a machine, Warp compiles its kernels, which takes about a minute.")

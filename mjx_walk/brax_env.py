@@ -1,4 +1,4 @@
-"""The former place of `mjx_walk.BraxEnv`."""
+"""The former module of `mjx_walk.BraxEnv`."""
 
 import warnings
 

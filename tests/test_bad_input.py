@@ -31,7 +31,7 @@ CASES = [
     (["physics=bullet"], "physics=bullet: choose one of: auto, warp, jax, c"),
     (["env.version=v3"], "env.version=v3: choose one of: v5, v4"),
     (["recipe=nope"], "recipes: cpu/humanoid_a2c"),
-    (["recipe=report/e_td3", "algo=sac"], "this recipe does not suit the env and algo that were asked for"),
+    (["recipe=report/e_td3", "algo=sac"], "this recipe does not fit the given env and algo"),
     (["device=2"], "unknown key 'device'; did you mean: devices?"),
     (["seedz=2"], "unknown key 'seedz'; did you mean: seed, seeds?"),
     (["num_env=4"], "unknown key 'num_env'; did you mean: num_envs"),

@@ -1,8 +1,7 @@
-"""The configuration: its schema, and how command lines become it."""
+"""The configuration of a run: its schema, and how command lines and files become one."""
 
 import dataclasses
 import difflib
-import os
 import warnings
 from collections.abc import Collection
 from pathlib import Path
@@ -24,7 +23,25 @@ from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import ENGINES
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import setting, validate
+from mjx_walk.utils.settings import has_effect, refuse_ineffective, setting, validate
+
+__all__ = [
+    "CONFIG_DIR",
+    "CheckpointConfig",
+    "Config",
+    "complete_overrides",
+    "compose_config",
+    "flatten",
+    "load_config",
+    "present_key",
+    "present_overrides",
+    "read_config",
+    "recipe_names",
+    "register_schemas",
+    "save_config",
+    "to_config",
+    "training_command",
+]
 
 _RENAMED = {
     "updates_per_chunk": "iterations_per_call",
@@ -39,51 +56,56 @@ _RENAMED = {
     "algo.entropy_cost": "algo.entropy_coef",
     "algo.mean_bound_cost": "algo.mean_bound_coef",
 }
-"""Settings by their former names. Saved configurations may hold these; on a command line they warn."""
+"""Present names of settings by their former names. Saved configurations load silently; command lines warn."""
 
 CONFIG_DIR = str(Path(__file__).parents[1] / "configs")
+"""Folder of the Hydra groups and recipes."""
 
 
 @dataclasses.dataclass
 class CheckpointConfig:
-    """Saving."""
+    """Settings of checkpoints."""
 
     every_calls: int = setting(50, at_least=1)
+    """Program calls from one checkpoint to the next."""
     keep: int = setting(3, at_least=1)
-    """Newest checkpoints kept; the best policy is kept beside them."""
+    """Number of newest checkpoints to keep. The best policy is kept separately."""
 
 
 @dataclasses.dataclass
 class Config:
-    """One training run."""
+    """Settings of one training run."""
 
     env: Any = None
-    """A task's options, see `mjx_walk.envs`."""
+    """Options of the task, see `mjx_walk.envs`."""
     algo: Any = None
-    """An algorithm's settings, see `mjx_walk.algos`."""
+    """Settings of the algorithm, see `mjx_walk.algos`."""
     hardware: str = setting("gpu", choices=("gpu", "cpu"))
-    """Which size of recipe; chosen by itself."""
+    """Size of the recipe. The default follows from the devices that JAX sees."""
     physics: str = setting("auto", choices=("auto", *ENGINES))
+    """Physics engine, see `mjx_walk.envs.physics`."""
     seed: int = setting(0, at_least=0, at_most=2**32 - 1)
     num_envs: int = setting(8192, at_least=1)
+    """Training environments on each device."""
     total_steps: int = setting(100_000_000, at_least=1)
-    """Environment steps over all copies, rounded up to whole chunks."""
+    """Environment steps, summed over all environments and rounded up to a multiple of the steps of a call."""
     iterations_per_call: int = setting(1, at_least=1)
-    """Updates compiled into one program call; logging, evaluation and saving happen between chunks. With a single one
-    Warp records its kernels anew in most chunks, since some of what physics reads has moved."""
+    """Iterations compiled into one program call. Logging, filming and saving happen between calls. With a single
+    iteration, Warp records its kernels again in most calls, because arrays that the physics reads have moved."""
     run_dir: str | None = None
-    """By default `runs/ENV_ALGO/TIME`."""
+    """Folder of the run, by default `runs/ENV_ALGO/TIME`."""
     resume: bool = False
+    """Continue the run in `run_dir` from its newest checkpoint."""
     wandb_project: str | None = None
-    """Log to this project of Weights & Biases, too."""
+    """Weights & Biases project to log to."""
     matmul_precision: str = setting("tensorfloat32", choices=("tensorfloat32", "float32"))
-    """Of the networks; never of the physics."""
+    """Precision of the networks' matrix products. The physics always uses float32."""
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
 
 
 def register_schemas() -> None:
-    """Tell Hydra the schema and the groups that are classes: `env` and `algo`."""
+    """Register the schema and the groups `env` and `algo` with Hydra."""
     store = ConfigStore.instance()
     store.store(name="schema", node=Config)
     for name, (_, options) in TASKS.items():
@@ -96,11 +118,27 @@ def load_config(overrides: list[str]) -> Config:
     """Compose and check a configuration.
 
     Args:
-        overrides: as on the command line, `["env=walker2d", "algo.discount=0.99"]`. Without `hardware=` the size
-            of the recipe follows from the devices that JAX sees.
+        overrides: arguments of the command line, such as `["env=walker2d", "algo.discount=0.99"]`.
 
     Raises:
-        UserError: anything wrong, in one line that names the valid choices.
+        UserError: invalid overrides, in one line that names the valid choices; or a given setting that has no effect,
+            unless a run is resumed.
+    """
+    overrides = present_overrides(overrides)
+    config = compose_config(overrides)
+    if not config.resume:
+        refuse_ineffective(config, (override.partition("=")[0] for override in overrides))
+    return config
+
+
+def compose_config(overrides: list[str]) -> Config:
+    """Compose a configuration and check its ranges, but not whether the given settings have an effect.
+
+    Args:
+        overrides: as for `load_config`.
+
+    Raises:
+        UserError: invalid overrides.
     """
     overrides = complete_overrides(overrides)
     register_schemas()
@@ -114,7 +152,7 @@ def load_config(overrides: list[str]) -> Config:
 
 
 def to_config(node: Any) -> Config:
-    """The checked dataclasses behind a composed OmegaConf node.
+    """Convert a composed OmegaConf node to checked dataclasses.
 
     Raises:
         UserError: a value is out of range.
@@ -126,11 +164,14 @@ def to_config(node: Any) -> Config:
 
 
 def complete_overrides(overrides: list[str]) -> list[str]:
-    """Refuse the override forms that slip past the schema, and add the recipe's size.
+    """Translate former names, add `hardware=`, and refuse override forms that bypass the schema.
+
+    Without `hardware=` the size of the recipe follows from the devices that JAX sees.
 
     Raises:
-        UserError: `+key`, `++key`, `~key`, something that is no override, or an unknown environment or algorithm.
+        UserError: `+key`, `++key` or `~key`, a malformed override, or an unknown environment or algorithm.
     """
+    overrides = present_overrides(overrides)
     try:
         parsed = OverridesParser.create().parse_overrides(overrides)
     except HydraException as error:
@@ -155,19 +196,27 @@ def present_key(key: str) -> str:
     return _RENAMED.get(key, key)
 
 
+def present_overrides(overrides: list[str]) -> list[str]:
+    """Overrides under the present names of their settings. A former name warns."""
+    present = []
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if key in _RENAMED:
+            warnings.warn(f"{key} is now {_RENAMED[key]}; the former name still works", stacklevel=2)
+        present.append(present_key(key) + equals + value)
+    return present
+
+
 def _as_text(override: Override) -> str:
-    """The override under its present name, its text quoted where Hydra would read the folder 2026_11_23 as a number."""
+    """The override's text, quoted where Hydra reads a folder name such as 2026_11_23 as a number."""
     key, line = override.key_or_group, str(override.input_line)
-    if key in _RENAMED:
-        warnings.warn(f"{key} is now {_RENAMED[key]}", stacklevel=2)
-        return f"{_RENAMED[key]}={line.partition('=')[2]}"
     if key in ("run_dir", "wandb_project") and isinstance(override.value(), (bool, int, float)):
         return f"{key}='{line.partition('=')[2]}'"
     return line
 
 
 def flatten(config: Config) -> dict[str, Any]:
-    """Every setting by its full key, as the run folder's `config.yaml` would give it back."""
+    """All settings by their full keys, with values as in `config.yaml`."""
 
     def walk(value: Any, prefix: str):
         for key, item in value.items():
@@ -180,15 +229,15 @@ def flatten(config: Config) -> dict[str, Any]:
 
 
 def save_config(config: Config, path: Path) -> None:
-    """Write the resolved configuration as YAML."""
+    """Write a configuration as YAML."""
     path.write_text(OmegaConf.to_yaml(OmegaConf.structured(config)))
 
 
 def read_config(path: Path) -> Config:
-    """Read what `save_config` wrote.
+    """Read a configuration that `save_config` wrote, under the present or the former names of its settings.
 
     Raises:
-        UserError: the file is not a configuration of this version.
+        UserError: the file is not a configuration that this version reads.
     """
     try:
         saved = _under_present_names(OmegaConf.load(path))
@@ -199,7 +248,7 @@ def read_config(path: Path) -> Config:
 
 
 def _under_present_names(saved: Any) -> Any:
-    """A saved configuration, its renamed settings moved to their present names."""
+    """Move the renamed settings of a saved configuration to their present names."""
     for old, new in _RENAMED.items():
         section, _, name = old.rpartition(".")
         node = OmegaConf.select(saved, section) if section else saved
@@ -213,11 +262,11 @@ def _first_line(error: BaseException) -> str:
 
 
 def _one_line(error: BaseException, overrides: list[str]) -> str:
-    """What the user needs of a Hydra error: its useful detail often sits in the cause."""
+    """The part of a Hydra error that helps the user. The useful detail is often in its cause."""
     texts = [str(error), str(error.__cause__ or "")]
-    if "raised while composing config" in texts[0]:  # Hydra's first line names the file, the second what is wrong
+    if "raised while composing config" in texts[0]:  # the first line names the file, the second the problem
         file, wrong = (line.strip() for line in texts[0].splitlines()[:2])
-        return f"{file.partition(':')[0]}: {wrong}; this recipe does not suit the env and algo that were asked for"
+        return f"{file.partition(':')[0]}: {wrong}; this recipe does not fit the given env and algo"
     if any("not in struct" in text or "not in '" in text or "Could not override" in text for text in texts):
         valid = list(
             flatten(load_config([o for o in overrides if o.startswith(("env=", "algo=", "hardware=", "recipe="))]))
@@ -237,13 +286,13 @@ def _one_line(error: BaseException, overrides: list[str]) -> str:
 
 
 def recipe_names() -> list[str]:
-    """What `recipe=` can be: `cpu/humanoid_ppo`."""
+    """Valid values of `recipe=`, such as `cpu/humanoid_ppo`."""
     folder = Path(CONFIG_DIR) / "recipe"
     return sorted(str(path.relative_to(folder).with_suffix("")) for path in folder.glob("**/[!_]*.yaml"))
 
 
 def training_command(config: Config) -> str:
-    """What trains with these settings, in few words: a recipe for task and algorithm, and what differs from it."""
+    """The shortest training command for a configuration: a recipe, and the settings that differ from it."""
     given = [f"env={config.env.name}", f"algo={config.algo.name}"]
     usual = f"{config.hardware}/{config.env.name}_{config.algo.name}"
     recipes = [f"recipe={name}" for name in recipe_names() if Path(name).name == Path(usual).name and name != usual]
@@ -251,12 +300,12 @@ def training_command(config: Config) -> str:
     commands = []
     for asked in (given, *([*given, recipe] for recipe in recipes)):
         settings = flatten(load_config([f"hardware={config.hardware}", *asked]))
-        learned_from = (key for key in sorted(own) if not key.startswith(_NOT_LEARNED_FROM))
-        commands.append([*asked, *(f"{key}={own[key]}" for key in learned_from if own[key] != settings.get(key))])
+        relevant = (key for key in sorted(own) if not key.startswith(_IRRELEVANT) and has_effect(config, key))
+        commands.append([*asked, *(f"{key}={own[key]}" for key in relevant if own[key] != settings.get(key))])
     return " ".join(["python -m mjx_walk.train", *min(commands, key=len)])
 
 
-_NOT_LEARNED_FROM = (
+_IRRELEVANT = (
     "hardware",
     "physics",
     "iterations_per_call",
@@ -266,10 +315,4 @@ _NOT_LEARNED_FROM = (
     "evaluation.",
     "checkpoint.",
 )
-"""How the keys begin that a command may leave out and still train the same."""
-
-
-def compile_cache_dir() -> str:
-    """Where compiled programs are kept between runs: `JAX_COMPILATION_CACHE_DIR`, else the user's cache."""
-    default = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "mjx_walk" / "jax"
-    return os.environ.get("JAX_COMPILATION_CACHE_DIR", str(default))
+"""Prefixes of settings that do not influence the trained policy."""

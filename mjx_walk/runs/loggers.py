@@ -1,7 +1,8 @@
-"""Where the rows of a run go: `metrics.jsonl`, TensorBoard, Weights & Biases, the terminal."""
+"""Loggers for the rows of a run: `metrics.jsonl`, TensorBoard, Weights & Biases, the terminal."""
 
 import importlib.util
 import json
+import logging
 import math
 import secrets
 import sys
@@ -17,8 +18,11 @@ from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.tensorboard import SummaryWriter
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["MetricsWriter", "Progress", "WandbLog", "require_wandb"]
+
+_PROGRESS = logging.getLogger("mjx_walk.progress")
 _SECONDS_BETWEEN_LINES = 10.0
-"""Where there is no terminal, progress is a plain line this often."""
+"""Interval of progress lines outside a terminal."""
 
 
 class MetricsWriter:
@@ -28,7 +32,7 @@ class MetricsWriter:
         """
         Args:
             run_dir: the run folder.
-            resume_steps: where the run resumes; rows written after that by the interrupted run are dropped.
+            resume_steps: environment steps at which the run resumes. Later rows of the interrupted run are dropped.
         """
         path = run_dir / "metrics.jsonl"
         if resume_steps is not None:
@@ -40,22 +44,23 @@ class MetricsWriter:
         )
 
     def write(self, row: Row) -> None:
-        """Write one row; `env_steps` is its place on the horizontal axis."""
+        """Write one row. `env_steps` is its position on the horizontal axis."""
         self._file.write(json.dumps({k: v if math.isfinite(v) else None for k, v in row.items()}) + "\n")
         for name, value in row.items():
             if "/" in name and math.isfinite(value):
                 self._events.add_scalar(name, value, int(row["env_steps"]))
 
     def close(self) -> None:
+        """Close both files."""
         self._file.close()
         self._events.close()
 
 
 def require_wandb(config: Config) -> None:
-    """Before a run begins that is to be logged there.
+    """Check that Weights & Biases can log a run, if its configuration asks for that.
 
     Raises:
-        UserError: the package is not installed, or nobody is logged in.
+        UserError: the package is not installed, or the user is not logged in.
     """
     if not config.wandb_project:
         return
@@ -72,13 +77,13 @@ def require_wandb(config: Config) -> None:
 
 
 class WandbLog:
-    """One W&B run for one run folder; a resumed run goes on in it. `WANDB_MODE=offline` keeps it on the disk."""
+    """The W&B run of a run folder. A resumed run continues it. `WANDB_MODE=offline` keeps it on disk."""
 
     def __init__(self, config: Config, folder: RunFolder):
         """
         Args:
-            config: with `wandb_project`.
-            folder: prepared run folder; `wandb_id.txt` in it says which run is its own.
+            config: configuration with `wandb_project`.
+            folder: prepared run folder. Its `wandb_id.txt` holds the ID of the W&B run.
         """
         import wandb
 
@@ -95,20 +100,28 @@ class WandbLog:
         )
 
     def write(self, row: Row) -> None:
-        """Log one row at its environment steps. Steps that are there already, from before a run was resumed, stay."""
+        """Log one row at its environment steps. Rows that W&B already holds for these steps stay."""
         self._run.log({name: value for name, value in row.items() if math.isfinite(value)}, step=int(row["env_steps"]))
 
     def close(self) -> None:
-        """Until everything is sent, or on the disk."""
+        """Wait until all rows are uploaded or on disk."""
         self._run.finish()
 
 
 class Progress:
-    """A progress bar with steps, steps/s, return, episode length and time left; plain lines without a terminal."""
+    """Progress of a run as a bar in a terminal, else as log messages: speed, return, episode length, time left.
+
+    It stays silent unless the logger `mjx_walk.progress` shows information, as it does in commands.
+    """
 
     def __init__(self, total_steps: int, done_steps: int):
+        """
+        Args:
+            total_steps: environment steps at the end of the run.
+            done_steps: environment steps at the start.
+        """
         self._total = total_steps
-        self._is_terminal = sys.stderr.isatty()
+        self._is_terminal = sys.stderr.isatty() and _PROGRESS.isEnabledFor(logging.INFO)
         self._bar = tqdm(
             total=total_steps, initial=done_steps, unit="step", unit_scale=True, disable=not self._is_terminal
         )
@@ -116,7 +129,7 @@ class Progress:
         self._evaluated: float | None = None
 
     def update(self, row: Row) -> None:
-        """Show a row."""
+        """Show one row."""
         self._evaluated = row.get("eval/return", self._evaluated)
         facts = {
             "return": row.get("episode/return"),
@@ -132,11 +145,9 @@ class Progress:
             left = (self._total - row["env_steps"]) / max(row["speed/steps_per_second"], 1e-9)
             text = "  ".join(f"{name} {value}" for name, value in shown.items())
             rate = row["speed/steps_per_second"]
-            print(
-                f"{row['env_steps']:>13,.0f} steps  {rate:>9,.0f}/s  {text}  {max(left, 0):,.0f} s left",
-                file=sys.stderr,
-                flush=True,
-            )
+            steps, left = row["env_steps"], max(left, 0)
+            _PROGRESS.info("%s", f"{steps:>13,.0f} steps  {rate:>9,.0f}/s  {text}  {left:,.0f} s left")
 
     def close(self) -> None:
+        """Leave the bar as it is."""
         self._bar.close()

@@ -1,4 +1,4 @@
-"""From the device's sums to named metrics, and the rows that hold them."""
+"""Named metrics from the device's sums, and the log rows that hold them."""
 
 import csv
 import json
@@ -9,24 +9,26 @@ import numpy as np
 
 from mjx_walk.utils.types import Metrics, Reduction
 
+__all__ = ["Row", "name_metrics", "physics_warnings", "read_rows", "write_csv"]
+
 Row = dict[str, float]
-"""One line of `metrics.jsonl`; see `name_metrics` for the names."""
+"""One line of `metrics.jsonl`. `name_metrics` lists the names."""
 
 _MANY = 0.01
-"""The fraction of non-finite steps above which they are no rare accident of the physics."""
+"""Fraction of non-finite steps above which the physics is not the likely reason."""
 
 
 def name_metrics(metrics: Metrics, steps_per_iteration: int) -> Row:
-    """Turn the metrics of one call into a log row.
+    """Convert the metrics of one call to a log row.
 
     Args:
-        metrics: `[iterations] f32` each: those of `VectorEnv.step` and `InlineEvaluator`, and the learner's.
+        metrics: `[iterations] f32` each: those of `VectorEnv.step`, of `InlineEvaluator` and of the algorithm.
         steps_per_iteration: environment steps of an iteration, over all devices.
 
     Returns:
-        `episode/…`: means over the episodes that ended (absent if none did); `physics/…` and `resets/…`: counts;
-        `train/…`: the learner's, absent without a value; and `eval/…` if an evaluation has ended, with the environment
-        steps before its policy as `eval/env_steps`.
+        `episode/…`: means over the finished episodes, absent if there are none. `physics/…` and `resets/…`: counts.
+        `train/…`: metrics of the algorithm, absent without a value. `eval/…`: the last finished evaluation, if there
+        is one; `eval/env_steps` are the steps after which its policy was copied.
     """
     by_reduction: dict[Reduction, dict[str, np.ndarray]] = {reduction: {} for reduction in Reduction}
     for name, metric in metrics.items():
@@ -53,29 +55,31 @@ def name_metrics(metrics: Metrics, steps_per_iteration: int) -> Row:
 
 
 def physics_warnings(row: Row, num_steps: int) -> dict[str, str]:
-    """What a user must know of the physics behind a row, by the metric that shows it.
+    """Warnings about the physics of a row, by the metric that shows the problem.
 
     Args:
-        row: from `name_metrics`.
-        num_steps: environment steps behind it.
+        row: result of `name_metrics`.
+        num_steps: environment steps of the row.
     """
     found = {}
     if row["physics/overflow"]:
         found["physics/overflow"] = (
-            "a Warp buffer overflowed, so that contacts were lost in some copies: enlarge CONTACTS_PER_ENV or "
+            "a Warp buffer overflowed and contacts were lost in some environments: enlarge CONTACTS_PER_ENV or "
             "CONSTRAINTS_PER_ENV in envs/physics/mjx_warp.py"
         )
     if row["physics/nonfinite"] > _MANY * num_steps:
         found["physics/nonfinite"] = (
-            f"{row['physics/nonfinite']:,.0f} of {num_steps:,} steps ended their episodes without a reward, since the "
-            "state, the observation or the reward was not finite: a reward or a model of your own may be why"
+            f"{row['physics/nonfinite']:,.0f} of {num_steps:,} steps ended their episodes without a reward, because "
+            "the state, the observation or the reward was not finite; check your own reward function or model"
         )
     return found
 
 
 def read_rows(path: Path) -> list[Row]:
-    """All rows of a `metrics.jsonl`. What is no row is left out, with a warning unless it is a last line cut off by a
-    crash."""
+    """All rows of a `metrics.jsonl`. Invalid lines are skipped with a warning.
+
+    A last line that a crash has cut off is skipped silently.
+    """
     if not path.exists():
         return []
     lines = path.read_text(errors="replace").splitlines()
@@ -85,7 +89,7 @@ def read_rows(path: Path) -> list[Row]:
         if row:
             rows.append(row)
         elif number < len(lines):
-            warnings.warn(f"line {number} of {path} cannot be read, and is left out", stacklevel=2)
+            warnings.warn(f"line {number} of {path} cannot be read and is skipped", stacklevel=2)
     return rows
 
 
@@ -98,8 +102,7 @@ def _as_row(line: str) -> Row | None:
 
 
 def write_csv(rows: list[Row], path: Path) -> Path:
-    """The same rows as a table, whose columns are all names that any row has, in their order; an unknown value is
-    empty."""
+    """Write rows as CSV with a column for every name in any row. Missing values are empty."""
     names = dict.fromkeys(name for row in rows for name in row)
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, names)

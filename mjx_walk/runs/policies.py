@@ -1,4 +1,4 @@
-"""The policy of a run, kept apart from its checkpoints: small enough to ship."""
+"""The best policy of a run, saved separately from its checkpoints and small enough to ship."""
 
 import dataclasses
 import functools
@@ -17,24 +17,26 @@ from mjx_walk.runs.config import Config, read_config
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["SavedPolicy", "deterministic_act", "make_task"]
+
 
 class SavedPolicy:
-    """The best policy of a run folder, with the task that it was trained on."""
+    """The best policy of a run folder, and the task that it was trained on."""
 
     def __init__(self, folder: RunFolder, physics: str | None = None):
         """
         Args:
-            folder: of a run that has saved a policy.
-            physics: engine to use instead of the one that the run was trained on.
+            folder: folder of a run that has saved a policy.
+            physics: engine to use instead of the run's own.
 
         Raises:
-            UserError: there is no usable policy.
+            UserError: no usable policy.
         """
         self.path = folder.path
         self.config = _without_lost_reward(read_config(folder.config))
         engine = physics or _engine_here(self.config.physics)
         self.task = make_task(dataclasses.replace(self.config, physics=engine))
-        # It acts in float32, whatever it learned in: the same on every machine.
+        # Acting in float32 gives the same actions on every machine.
         algo = dataclasses.replace(self.config.algo, network_dtype="float32")
         self.algorithm = make_algorithm(self.task, self.config.num_envs, self.config.evaluation, algo)
         state = jax.eval_shape(self.algorithm.init, jax.random.PRNGKey(0))
@@ -43,11 +45,11 @@ class SavedPolicy:
 
     @functools.cached_property
     def act(self) -> Callable:
-        """`policy` as a compiled JAX function of f32 observations."""
+        """The deterministic policy as a compiled JAX function of f32 observations."""
         return deterministic_act(self.algorithm, self.policy_params)
 
     def policy(self, obs: np.ndarray) -> np.ndarray:
-        """The deterministic action for one observation or a batch, in Gymnasium's units on both sides.
+        """The deterministic action for one observation or a batch, in Gymnasium's units.
 
         Args:
             obs: `[…, observation_size]`, any float dtype.
@@ -56,12 +58,12 @@ class SavedPolicy:
 
 
 def make_task(config: Config) -> Task:
-    """The unbatched environment of a configuration."""
+    """Build the unbatched environment of a configuration."""
     return TASKS[config.env.name][0](config.env, config.physics)
 
 
 def deterministic_act(algorithm: Algorithm, policy_params: Any) -> Callable[[Any], Any]:
-    """The policy without noise, compiled: `obs […, observation_size] → action […, action_size]`, Gymnasium's units."""
+    """Compile the deterministic policy, `obs […, observation_size] → action […, action_size]`, in Gymnasium's units."""
     policy = algorithm.policy(policy_params, deterministic=True)
     return jax.jit(lambda obs: policy(obs, jax.random.PRNGKey(0)))
 
@@ -83,7 +85,7 @@ def load_best_policy(folder: RunFolder, like: Any) -> tuple[Any, dict[str, Any]]
 
 
 def _engine_here(name: str) -> str:
-    """The engine that a run was trained on, or this machine's own, where that one does not run."""
+    """The engine that a run was trained on, or `auto` if this machine does not support it."""
     try:
         return resolve_engine(name)
     except UserError:
@@ -91,7 +93,7 @@ def _engine_here(name: str) -> str:
 
 
 def _without_lost_reward(config: Config) -> Config:
-    """Without a reward function whose file is gone: neither the policy nor its score needs it."""
+    """Drop a reward function whose file is missing. The policy and its score do not need it."""
     source = config.env.reward_function
     if source is None or reward_file(source).is_file():
         return config

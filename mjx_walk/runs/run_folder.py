@@ -1,4 +1,4 @@
-"""The folder of a run: what belongs where, and who may write into it."""
+"""The folder of a run: its paths, and the checks before a run writes into it."""
 
 import dataclasses
 import datetime
@@ -8,8 +8,10 @@ from mjx_walk.runs.checkpoint import list_steps
 from mjx_walk.runs.config import Config, flatten, read_config, save_config
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["MAY_DIFFER", "RunFolder", "differences", "new_path", "open_existing", "prepare"]
+
 MAY_DIFFER = ("run_dir", "resume", "total_steps", "algo.schedule_steps", "wandb_project", "evaluation.films")
-"""Keys that a resumed run may be given anew."""
+"""Settings that may change when a run is resumed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,16 +42,16 @@ class RunFolder:
 
 
 def new_path(config: Config) -> Path:
-    """Where a run goes if nothing is said."""
+    """The default folder of a new run."""
     now = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     return Path("runs") / f"{config.env.name}_{config.algo.name}" / now
 
 
 def open_existing(path: str | Path | None) -> RunFolder:
-    """A folder that a run has written.
+    """Open the folder of an existing run.
 
     Raises:
-        UserError: none is given, or there is no run at that path.
+        UserError: no path, or no run at that path.
     """
     if path is None:
         raise UserError("say which run: run=RUN_DIR")
@@ -60,23 +62,24 @@ def open_existing(path: str | Path | None) -> RunFolder:
 
 
 def prepare(configs: list[Config]) -> tuple[list[RunFolder], list[Config]]:
-    """The folders to train in side by side, made or resumed. All are looked at before any is touched, and nothing that
-    is there is overwritten.
+    """Create or check the folders of runs that train together. Nothing is overwritten.
+
+    All folders are checked before the first one is created.
 
     Args:
-        configs: of the runs, which may differ in `seed` and `run_dir`.
+        configs: configurations of the runs, which may differ in `seed` and `run_dir`.
 
     Returns:
         The folders, and the configurations with `run_dir` filled in.
 
     Raises:
-        UserError: a folder holds something else, or another run; or, to resume, another configuration, or runs that
-            cannot go on side by side.
+        UserError: a folder holds other files or another run. When resuming: the configuration differs, or the runs
+            cannot train together.
     """
     first = configs[0]
     if first.run_dir is None:
         if first.resume:
-            raise UserError("resume=true needs run_dir=PATH of the run to go on with")
+            raise UserError("resume=true needs run_dir=PATH of the run to continue")
         configs = [dataclasses.replace(config, run_dir=str(new_path(config))) for config in configs]
     folders = [RunFolder(Path(str(config.run_dir))) for config in configs]
     for folder, config in zip(folders, configs, strict=True):
@@ -90,7 +93,7 @@ def prepare(configs: list[Config]) -> tuple[list[RunFolder], list[Config]]:
     for folder, config in zip(folders, configs, strict=True):
         try:
             folder.checkpoints.mkdir(parents=True, exist_ok=config.resume)
-            if not config.resume:  # else once there is a checkpoint to go on from
+            if not config.resume:  # a resumed run saves it after it has found a checkpoint
                 save_config(config, folder.config)
         except OSError as error:
             raise UserError(f"cannot write to run_dir={config.run_dir}: {error.strerror}") from error
@@ -98,7 +101,13 @@ def prepare(configs: list[Config]) -> tuple[list[RunFolder], list[Config]]:
 
 
 def differences(saved: Config, config: Config, besides: tuple[str, ...] = MAY_DIFFER) -> list[str]:
-    """The settings in which a run differs from what is asked for now, or from another one."""
+    """The settings in which two configurations differ, with both values, for messages.
+
+    Args:
+        saved: the former configuration.
+        config: the present one.
+        besides: keys to ignore.
+    """
     old, new = flatten(saved), flatten(config)
     return [
         f"{key} (was {old.get(key)}, now {new.get(key)})"
@@ -108,7 +117,7 @@ def differences(saved: Config, config: Config, besides: tuple[str, ...] = MAY_DI
 
 
 def _check(folder: RunFolder, config: Config) -> None:
-    """That a run may begin, or go on, in a folder."""
+    """Check that a run may start or continue in a folder."""
     if folder.path.exists() and not folder.path.is_dir():
         raise UserError(f"run_dir={config.run_dir} is a file; choose another path")
     if not config.resume:
@@ -122,14 +131,12 @@ def _check(folder: RunFolder, config: Config) -> None:
     if differing:
         raise UserError(f"resume=true with another configuration than {folder.config}: {'; '.join(differing)}")
     if folder.gymnasium_scores.exists() and not list_steps(folder.checkpoints):
-        raise UserError(
-            f"no checkpoint in {folder.checkpoints}, though the run was scored; begin it in another run_dir"
-        )
+        raise UserError(f"no checkpoint in {folder.checkpoints}, although the run was scored; choose another run_dir")
     if config.total_steps < saved.total_steps:
         raise UserError(f"total_steps={config.total_steps} is below this run's {saved.total_steps}; it may only grow")
 
 
 def _newest(folder: RunFolder) -> str:
-    """The steps behind the newest checkpoint."""
+    """The environment steps of the newest checkpoint."""
     saved = list_steps(folder.checkpoints)
     return f"{int(saved[-1].name):,}" if saved else "0"

@@ -1,18 +1,18 @@
 """TensorBoard's event files, without PyTorch.
 
-Where PyTorch is installed, tensorboardX imports it, for tensors that nothing here hands in; that takes seconds.
+tensorboardX imports PyTorch where it is installed, which takes seconds. Nothing here passes its tensors.
 """
 
 import sys
 
-_KNOWN = "torch" in sys.modules
-if not _KNOWN:
-    sys.modules["torch"] = None  # type: ignore[assignment]  # what Python takes for a module that is not there
+_HAS_TORCH = "torch" in sys.modules
+if not _HAS_TORCH:
+    sys.modules["torch"] = None  # type: ignore[assignment]  # makes `import torch` fail
 try:
     from tensorboardX import SummaryWriter
     from tensorboardX.proto.summary_pb2 import Summary
 finally:
-    if not _KNOWN:
+    if not _HAS_TORCH:
         del sys.modules["torch"]
 
 __all__ = ["Summary", "SummaryWriter"]

@@ -1,12 +1,17 @@
-"""What all commands share: `key=value` arguments, and one line and exit code 2 for a user's mistake."""
+"""What all commands share: `key=value` arguments, output, and exit codes.
 
+Invalid input prints a one-line error and exits with code 2.
+"""
+
+import contextlib
 import dataclasses
 import difflib
 import errno
+import logging
 import sys
 import typing
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -20,16 +25,18 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import validate
 from mjx_walk.utils.signals import Stopped, exit_code
 
+__all__ = ["check_suffix", "check_writable", "main", "parse", "parse_own", "read_seeds", "stay_on_cpu"]
+
 Arguments = TypeVar("Arguments")
 
 
 def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Arguments:
-    """Read `key=value` arguments into a dataclass.
+    """Read `key=value` arguments into a dataclass. `--help` prints the usage and exits.
 
     Args:
-        schema: dataclass with defaults; `validate` checks its ranges.
-        arguments: as on the command line.
-        usage: printed for `--help`.
+        schema: dataclass with defaults and ranges, see `settings.setting`.
+        arguments: the command line.
+        usage: text for `--help`.
 
     Raises:
         UserError: an unknown key, a wrong type, or a value out of range.
@@ -58,16 +65,16 @@ def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Argument
 def parse_own(
     schema: type[Arguments], others: type[Any], arguments: list[str], usage: str
 ) -> tuple[Arguments, list[str]]:
-    """The same of those arguments whose keys are the schema's; and the rest, which are a training's settings.
+    """Read the arguments whose keys are in the schema, and return the others, which are settings of a training run.
 
     Args:
         schema: as for `parse`.
-        others: dataclass of the training's settings.
-        arguments: as on the command line.
-        usage: printed for `--help`.
+        others: dataclass of a training run's settings.
+        arguments: the command line.
+        usage: text for `--help`.
 
     Raises:
-        UserError: a wrong type, a value out of range, or a key that looks like one of the schema's.
+        UserError: a wrong type, a value out of range, or an unknown key that resembles one of the schema.
     """
     own_keys, other_keys = ([field.name for field in dataclasses.fields(kind)] for kind in (schema, others))  # type: ignore[arg-type]
     own: list[str] = []
@@ -84,10 +91,10 @@ def parse_own(
 
 
 def read_seeds(value: Any) -> list[int]:
-    """`seeds=3` is 0, 1 and 2; `seeds=[3,7]` these.
+    """Seeds as a list. `seeds=3` means 0, 1 and 2, and `seeds=[3,7]` means 3 and 7.
 
     Raises:
-        UserError: neither, or one twice.
+        UserError: neither a number nor a list of different seeds.
     """
     seeds = list(range(value)) if type(value) is int else value
     are_seeds = isinstance(seeds, list) and all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds)
@@ -97,10 +104,10 @@ def read_seeds(value: Any) -> list[int]:
 
 
 def check_writable(path: Path) -> None:
-    """Before work is done for a file.
+    """Check that a file can be written, before a command works for it. A new file is removed again.
 
     Raises:
-        UserError: nothing can be written there.
+        UserError: the file or its folder cannot be written.
     """
     is_new = not path.exists()
     try:
@@ -114,19 +121,19 @@ def check_writable(path: Path) -> None:
 
 
 def check_suffix(path: Path | None, *suffixes: str) -> None:
-    """Before work is done for a file.
+    """Check that a file name ends in one of the suffixes, before a command works for it.
 
     Raises:
-        UserError: it is of a kind that is not written.
+        UserError: another ending.
     """
     if path and path.suffix.lower() not in suffixes:
         raise UserError(f"{path}: give it one of these endings: {', '.join(suffixes)}")
 
 
 def stay_on_cpu() -> None:
-    """For a command that steps environments one by one with MuJoCo's C library, also where JAX would take a GPU.
+    """Run JAX on the CPU, for commands that step single environments with MuJoCo's C library.
 
-    It has no effect on a process that has used JAX before.
+    It has no effect once JAX has started.
     """
     jax.config.update("jax_platforms", "cpu")
 
@@ -137,34 +144,68 @@ _usual_format = warnings.formatwarning
 def _in_one_line(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
 ) -> str:
-    """A warning that is meant for the user without the line of code that it came from."""
+    """Format a warning for users as one line, without its source code."""
     if category is UserWarning:
         return f"warning: {message}\n"
     return _usual_format(message, category, filename, lineno, line)
 
 
-_DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
+
+
+class _Console(logging.Handler):
+    """Print log messages without a prefix: information to stdout, warnings and progress to stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        is_warning = record.levelno >= logging.WARNING
+        text = f"{record.levelname.lower()}: {record.getMessage()}" if is_warning else record.getMessage()
+        is_progress = record.name == "mjx_walk.progress"
+        print(text, file=sys.stderr if is_warning or is_progress else sys.stdout, flush=True)
+
+
+@contextlib.contextmanager
+def _console() -> Iterator[None]:
+    """Show this package's log messages and format warnings in one line."""
+    logger, handler = logging.getLogger("mjx_walk"), _Console()
+    level, propagate, format_warning = logger.level, logger.propagate, warnings.formatwarning
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    logger.propagate = False  # other libraries may have added handlers to the root logger
+    warnings.formatwarning = _in_one_line
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+        logger.propagate = propagate
+        warnings.formatwarning = format_warning
 
 
 def main(command: Callable[[list[str]], int | None]) -> NoReturn:
-    """Run a command on the process's arguments and exit with its code; a mistake, a disk that is full or must not be
-    written to, and Ctrl-C cost one line, and so does a warning."""
-    warnings.formatwarning = _in_one_line
-    exempt_imports_from_gc()
-    prepare_jax()
+    """Run a command on the arguments of this process, and exit with its exit code.
+
+    Invalid input, a full or read-only disk, and Ctrl-C print one line instead of a traceback.
+    """
+    with _console():
+        exempt_imports_from_gc()
+        prepare_jax()
+        sys.exit(_exit_code_of(command))
+
+
+def _exit_code_of(command: Callable[[list[str]], int | None]) -> int:
     try:
-        sys.exit(command(sys.argv[1:]) or 0)
+        return command(sys.argv[1:]) or 0
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+        return 2
     except OSError as error:
-        if error.errno not in _DISK_TROUBLE:
+        if error.errno not in _DISK_ERRORS:
             raise
         print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+        return 2
     except Stopped as stopped:
         print(f"Stopped by {stopped.signal_name}.", file=sys.stderr)
-        sys.exit(exit_code(stopped.signal_name))
+        return exit_code(stopped.signal_name)
     except KeyboardInterrupt:
         print("Stopped by Ctrl-C.", file=sys.stderr)
-        sys.exit(exit_code("SIGINT"))
+        return exit_code("SIGINT")

@@ -1,23 +1,30 @@
-"""What the releases of JAX and MJX that we run on need, set by whoever starts a program, never by an import."""
+"""What the supported releases of JAX and MJX need. Programs call these functions; no import does."""
 
+import contextlib
 import gc
 import os
 import warnings
+from collections.abc import Iterator
+from pathlib import Path
 
 import jax
+from jax.experimental.compilation_cache import compilation_cache
+
+__all__ = ["default_cache_dir", "exempt_imports_from_gc", "prepare_jax", "temporary_jax_settings"]
 
 _FUSION_TYPE = "--xla_cpu_experimental_ynn_fusion_type"
 
 
 def prepare_jax() -> None:
-    """Set what correct programs need, before JAX compiles the first one; a later call changes nothing.
+    """Set the XLA flag that correct programs need on a CPU. Call it before JAX compiles its first program.
 
-    XLA compiles reductions on a CPU itself, unless `XLA_FLAGS` names another fusion type. From jaxlib 0.10.2 on it
-    hands those over large batches to YNNPACK, which reads memory that was never written. It sums wrongly in 0.10.2
-    (jax-ml/jax#39103), and MJX's steps are not finite in 0.11.2 either, as soon as new memory holds something other
-    than zeros (`MALLOC_PERTURB_=128`).
+    From jaxlib 0.10.2 on, XLA hands reductions over large batches to YNNPACK, which reads uninitialized memory.
+    In 0.10.2 the sums are wrong (jax-ml/jax#39103). In 0.11.2 MJX's steps are not finite either, as soon as new memory
+    holds something other than zeros (`MALLOC_PERTURB_=128`). The flag keeps reductions in XLA's own code. A fusion type
+    that `XLA_FLAGS` already names stays.
 
-    Commands, `mjx_walk.run` and `mjx_walk.make_env` call this. It warns where JAX has started without the flag.
+    Commands, `mjx_walk.run`, `mjx_walk.load_run` and `mjx_walk.make_env` call this function; further calls do nothing.
+    It warns once if JAX already runs on a CPU without the flag.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if _FUSION_TYPE in flags:
@@ -25,7 +32,7 @@ def prepare_jax() -> None:
     os.environ["XLA_FLAGS"] = f"{flags} {_FUSION_TYPE}=-reduce".lstrip()
     if _has_started() and jax.default_backend() == "cpu":
         warnings.warn(
-            f"JAX started without XLA_FLAGS={_FUSION_TYPE}=-reduce, and may sum wrongly over large batches on a CPU; "
+            f"JAX started without XLA_FLAGS={_FUSION_TYPE}=-reduce and may sum wrongly over large batches on a CPU; "
             "call mjx_walk.prepare_jax() before you use JAX",
             stacklevel=3,
         )
@@ -35,10 +42,42 @@ def _has_started() -> bool:
     return jax._src.xla_bridge.backends_are_initialized()
 
 
-def exempt_imports_from_gc() -> None:
-    """Exempt all objects that exist now from garbage collection; for commands, at their start.
+@contextlib.contextmanager
+def temporary_jax_settings(matmul_precision: str) -> Iterator[None]:
+    """Compile with a matrix product precision and a compilation cache, and restore the caller's settings at the end.
 
-    MJX makes half a million objects that stay. Python would search them for cycles again and again, and once more when
-    the process ends.
+    A cache folder that the caller has chosen, by `JAX_COMPILATION_CACHE_DIR` or `jax.config`, stays.
+
+    Args:
+        matmul_precision: a value of `jax_default_matmul_precision`.
+    """
+    has_cache = jax.config.jax_compilation_cache_dir is not None  # type: ignore[attr-defined]
+    with jax.default_matmul_precision(matmul_precision):
+        if has_cache:
+            yield
+            return
+        _set_cache_dir(str(default_cache_dir()))
+        try:
+            yield
+        finally:
+            _set_cache_dir(None)
+
+
+def _set_cache_dir(path: str | None) -> None:
+    """Change JAX's cache folder. JAX opens a folder once, so it has to close the former one."""
+    compilation_cache.reset_cache()
+    jax.config.update("jax_compilation_cache_dir", path)
+
+
+def default_cache_dir() -> Path:
+    """The folder of compiled programs, below the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "mjx_walk" / "jax"
+
+
+def exempt_imports_from_gc() -> None:
+    """Exempt all present objects from garbage collection. Commands call this at their start.
+
+    MJX creates half a million permanent objects. Otherwise Python searches them for cycles repeatedly, and once more
+    when the process ends.
     """
     gc.freeze()

@@ -1,4 +1,4 @@
-"""The devices of this machine: how many, which one a process sees, and how much memory it has."""
+"""The devices of this machine: their number, their memory, and which one a process sees."""
 
 import os
 import subprocess
@@ -12,7 +12,13 @@ from mjx_walk.utils.errors import UserError
 
 
 def count_devices() -> tuple[str, int]:
-    """`gpu` or `cpu`, and how many; asked in another process, since JAX would claim the memory of all of them."""
+    """`gpu` or `cpu`, and the number of devices. A CPU counts as one.
+
+    A child process asks JAX, because JAX claims the memory of all GPUs that it initializes.
+
+    Raises:
+        UserError: JAX does not start.
+    """
     code = "import jax; print(jax.default_backend() != 'cpu', jax.local_device_count())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     if done.returncode:
@@ -22,18 +28,22 @@ def count_devices() -> tuple[str, int]:
 
 
 def only_device(device: int) -> dict[str, str]:
-    """The environment variable that lets a process see one of the GPUs that this one sees."""
+    """The environment variable that restricts a child process to one GPU.
+
+    Args:
+        device: index among the GPUs that this process sees.
+    """
     visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
     return {"CUDA_VISIBLE_DEVICES": visible[device] if visible else str(device)}
 
 
 def num_bytes(make: Callable[..., Any], *args: Any) -> int:
-    """Bytes of the pytree that `make` would return, without making it."""
+    """Bytes of the pytree that `make(*args)` returns, without running it."""
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(make, *args)))
 
 
 def device_memory() -> int:
-    """Bytes that JAX may allocate on its first device."""
+    """Bytes of memory that JAX may allocate on its first device."""
     stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:
         return stats["bytes_limit"]

@@ -1,5 +1,5 @@
-"""The one exception for what a user can put right."""
+"""The exception for errors that the user can correct."""
 
 
 class UserError(ValueError):
-    """A mistake in what the user asked for. Commands print its one line and exit with code 2, without a traceback."""
+    """Invalid input. Commands print its one-line message without a traceback and exit with code 2."""

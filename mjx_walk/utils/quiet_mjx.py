@@ -1,7 +1,7 @@
-"""Imported before MJX and before Brax, which imports MJX: the import is faster, and prints nothing.
+"""Import MJX quickly and silently. Import this module before Brax, which imports MJX.
 
-MJX makes half a million objects, among which Python would search for garbage while they are made. Where Warp is not
-installed, MJX prints two lines that say so; engines say it where it matters.
+MJX creates half a million objects. The import disables garbage collection while it creates them. Without Warp, MJX
+prints two lines about it. This module hides them, because engines report a missing Warp where it matters.
 """
 
 import contextlib

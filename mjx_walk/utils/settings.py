@@ -1,10 +1,19 @@
-"""Settings that know their valid range: declared beside the default, checked in one place."""
+"""Settings that declare their valid range, and where they have an effect, next to their default."""
 
 import dataclasses
 import math
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 from mjx_walk.utils.errors import UserError
+
+__all__ = ["AnyBut", "has_effect", "refuse_ineffective", "setting", "validate"]
+
+
+class AnyBut(NamedTuple):
+    """A condition on a setting: every value except this one."""
+
+    value: Any
 
 
 def setting(
@@ -15,17 +24,30 @@ def setting(
     at_most: float | None = None,
     below: float | None = None,
     choices: tuple[str, ...] | None = None,
+    only_if: dict[str, Any] | None = None,
 ) -> Any:
-    """A dataclass field with a default and the range that `validate` holds it to; for a tuple, each of its items."""
+    """A dataclass field with a default, a valid range and a condition.
+
+    Args:
+        default: its value unless another one is given.
+        above: exclusive lower bound; for a tuple, of each item, as the other bounds.
+        at_least: inclusive lower bound.
+        at_most: inclusive upper bound.
+        below: exclusive upper bound.
+        choices: valid values.
+        only_if: values of other settings of the same dataclass, or `AnyBut` a value. The setting has an effect if one
+            of them matches and has an effect itself. An empty dictionary: the setting never has an effect.
+    """
     limits = {"above": above, "at_least": at_least, "at_most": at_most, "below": below, "choices": choices}
-    return dataclasses.field(default=default, metadata={k: v for k, v in limits.items() if v is not None})
+    metadata = {k: v for k, v in (limits | {"only_if": only_if}).items() if v is not None}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 def validate(config: Any, prefix: str = "") -> None:
-    """Check every setting of a dataclass, nested ones included.
+    """Check the ranges of all settings of a dataclass and of the dataclasses in it.
 
     Raises:
-        UserError: the first value out of range, named by its full key. NaN is never in range.
+        UserError: the first value out of range, with its full key. NaN is never in range.
     """
     for field in dataclasses.fields(config):
         value, key = getattr(config, field.name), prefix + field.name
@@ -43,7 +65,7 @@ def _problem(value: Any, limits: Any) -> str | None:
         return None
     if isinstance(value, float) and math.isnan(value):
         return "must be a number"
-    # Written so that a value that compares with nothing fails.
+    # A value that compares with nothing fails these tests.
     if "above" in limits and not value > limits["above"]:
         return f"must be above {limits['above']}"
     if "at_least" in limits and not value >= limits["at_least"]:
@@ -57,3 +79,65 @@ def _problem(value: Any, limits: Any) -> str | None:
     if ("above" in limits or "at_least" in limits) and isinstance(value, float) and math.isinf(value):
         return "must be finite"
     return None
+
+
+def refuse_ineffective(config: Any, keys: Iterable[str]) -> None:
+    """Check that explicitly given settings have an effect under the values of the others.
+
+    Args:
+        config: dataclass with all values.
+        keys: full keys of the given settings. Keys that are not in the dataclass are skipped.
+
+    Raises:
+        UserError: the first setting without effect, with the values that disable it.
+    """
+    for key in keys:
+        owner, name = _find(config, key)
+        blockers = _blockers(owner, name)
+        if blockers is None:
+            continue
+        values = {key.removesuffix(name) + other: getattr(owner, other) for other in blockers}
+        reason = " and ".join(f"{other}={_as_yaml(value)}" for other, value in values.items())
+        reason = f"with {reason}; change that, or" if reason else "here;"
+        raise UserError(f"{key}={_as_yaml(getattr(owner, name))} has no effect {reason} leave it out")
+
+
+def has_effect(config: Any, key: str) -> bool:
+    """Whether a setting has an effect under the values of the others.
+
+    Args:
+        config: dataclass with all values.
+        key: full key of the setting.
+    """
+    return _blockers(*_find(config, key)) is None
+
+
+def _find(config: Any, key: str) -> tuple[Any, str]:
+    """The dataclass that holds a setting, and the setting's name in it."""
+    *sections, name = key.split(".")
+    for section in sections:
+        config = getattr(config, section, None)
+    return config, name
+
+
+def _blockers(owner: Any, name: str) -> list[str] | None:
+    """The settings whose values disable a setting, or None if it has an effect."""
+    fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
+    conditions = next((field.metadata.get("only_if") for field in fields if field.name == name), None)
+    if conditions is None:
+        return None
+    found: list[str] = []
+    for other, wanted in conditions.items():
+        value = getattr(owner, other)
+        if not (value != wanted.value if isinstance(wanted, AnyBut) else value == wanted):
+            found.append(other)
+            continue
+        further = _blockers(owner, other)
+        if further is None:
+            return None
+        found += further
+    return found
+
+
+def _as_yaml(value: Any) -> str:
+    return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))

@@ -1,18 +1,25 @@
-"""Signals: a run stops at the end of its chunk, and what comes after it as by Ctrl-C, instead of at once."""
+"""Signal handling: a run stops after its current call, and later stages stop as after Ctrl-C."""
 
 import contextlib
+import logging
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator
 
+__all__ = ["Interrupt", "Stopped", "as_by_ctrl_c", "exit_code"]
+
+_PROGRESS = logging.getLogger("mjx_walk.progress")
 _FROM_SCHEDULERS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR1") if hasattr(signal, name))
 
 
 class Interrupt:
-    """While entered, Ctrl-C, SIGTERM and SIGUSR1 only leave a note; a second Ctrl-C stops at once."""
+    """Context manager that records Ctrl-C, SIGTERM and SIGUSR1. A second Ctrl-C raises `KeyboardInterrupt`."""
 
-    def __init__(self, doing: str = "finishing this chunk, then saving") -> None:
+    def __init__(self, doing: str = "finishing this call, then saving") -> None:
+        """
+        Args:
+            doing: what the process does next, for the message.
+        """
         self._doing = doing
         self.signal_name: str | None = None
         self._handled = _handled_by(self._note, signal.SIGINT, *_FROM_SCHEDULERS)
@@ -28,11 +35,11 @@ class Interrupt:
         if self.signal_name and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.signal_name = signal.Signals(number).name
-        print(f"\n{self.signal_name}: {self._doing}", file=sys.stderr, flush=True)
+        _PROGRESS.info("\n%s: %s", self.signal_name, self._doing)
 
 
 class Stopped(KeyboardInterrupt):
-    """Ends what Ctrl-C would end, by another signal."""
+    """Raised by SIGTERM and SIGUSR1 where Ctrl-C raises `KeyboardInterrupt`."""
 
     def __init__(self, signal_name: str):
         """
@@ -44,7 +51,7 @@ class Stopped(KeyboardInterrupt):
 
 
 def as_by_ctrl_c() -> contextlib.AbstractContextManager[None]:
-    """While entered, SIGTERM and SIGUSR1 raise `Stopped`, so that what is being saved is saved, as after Ctrl-C."""
+    """Context manager in which SIGTERM and SIGUSR1 raise `Stopped`, so that cleanup runs as after Ctrl-C."""
 
     def stop(number: int, _) -> None:
         raise Stopped(signal.Signals(number).name)
@@ -55,7 +62,7 @@ def as_by_ctrl_c() -> contextlib.AbstractContextManager[None]:
 @contextlib.contextmanager
 def _handled_by(handler: Callable, *numbers: signal.Signals) -> Iterator[None]:
     previous = {}
-    if threading.current_thread() is threading.main_thread():  # elsewhere Python allows no handlers
+    if threading.current_thread() is threading.main_thread():  # Python allows handlers only there
         previous = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
@@ -65,5 +72,5 @@ def _handled_by(handler: Callable, *numbers: signal.Signals) -> Iterator[None]:
 
 
 def exit_code(signal_name: str) -> int:
-    """The shell's convention for a process that a signal ended."""
+    """The exit code that shells give a process ended by a signal."""
     return 128 + signal.Signals[signal_name].value

@@ -1,4 +1,4 @@
-"""Modules of this package in processes of their own."""
+"""Modules of this package as child processes."""
 
 import os
 import subprocess
@@ -10,13 +10,15 @@ _ROOT = Path(__file__).parents[2]
 
 
 def start_module(name: str, *arguments: str, env: dict[str, str] | None = None, **options: Any) -> subprocess.Popen:
-    """Start `python -m mjx_walk.NAME ARGUMENTS`, which finds this package wherever it lies; Ctrl-C is for the parent.
+    """Start `python -m mjx_walk.NAME ARGUMENTS` in a new session, so that Ctrl-C reaches only the parent.
+
+    The child imports the same copy of this package as its parent.
 
     Args:
-        name: of the module.
+        name: module name without the package.
         arguments: its command line.
-        env: variables beside those of this process.
-        options: further ones of `subprocess.Popen`.
+        env: environment variables to add to those of this process.
+        options: further arguments of `subprocess.Popen`.
     """
     paths = os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])
     return subprocess.Popen(

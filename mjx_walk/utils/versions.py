@@ -1,4 +1,4 @@
-"""The version of this package, and of all that its results depend on."""
+"""Versions of this package and of the packages that its results depend on."""
 
 import importlib.metadata
 import platform
@@ -9,7 +9,7 @@ _PACKAGES = ("gymnasium", "mujoco", "mujoco-mjx", "warp-lang", "jax", "brax", "n
 
 
 def package_versions() -> dict[str, str]:
-    """Versions by package name; packages that are not installed are left out."""
+    """Versions by package name, without packages that are not installed."""
     found = {"mjx_walk": __version__, "python": platform.python_version()}
     for name in _PACKAGES:
         try:

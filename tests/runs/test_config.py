@@ -1,13 +1,28 @@
 """Configurations: every recipe composes and fits its algorithm; what is saved is what is read."""
 
+import dataclasses
+import sys
 from pathlib import Path
 
 import pytest
 
+from mjx_walk import train as train_command
 from mjx_walk.algos import ALGORITHMS, make_algorithm
-from mjx_walk.api import make_task
+from mjx_walk.algos.ppo import PPOConfig
+from mjx_walk.api import make_task, resolve
 from mjx_walk.envs import TASKS
-from mjx_walk.runs.config import CONFIG_DIR, flatten, load_config, read_config, save_config
+from mjx_walk.experiments import planned_runs
+from mjx_walk.runs.config import (
+    CONFIG_DIR,
+    flatten,
+    load_config,
+    read_config,
+    register_schemas,
+    save_config,
+    training_command,
+)
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import AnyBut, setting
 
 RECIPES = sorted(
     str(path.relative_to(f"{CONFIG_DIR}/recipe"))[:-5] for path in Path(CONFIG_DIR).glob("recipe/?pu/[!_]*.yaml")
@@ -70,3 +85,97 @@ def test_overrides_beat_the_recipe(tmp_path):
     humanoid = load_config(["env.version=v4"])
     save_config(humanoid, tmp_path / "config.yaml")  # with its infinite contact_cost_range
     assert read_config(tmp_path / "config.yaml") == humanoid
+
+
+FORMER = ["algo.entropy_cost=0.25", "updates_per_chunk=3", "checkpoint.every_chunks=7"]
+PRESENT = {"algo.entropy_coef": 0.25, "iterations_per_call": 3, "checkpoint.every_calls": 7}
+
+
+def renamings(warned):
+    return [str(warning.message) for warning in warned if " is now " in str(warning.message)]
+
+
+def test_a_former_name_works_on_a_command_line_and_warns_once(recwarn):
+    config = flatten(resolve(FORMER))
+    assert PRESENT.items() <= config.items()
+    assert len(renamings(recwarn)) == 3
+    assert renamings(recwarn)[0] == "algo.entropy_cost is now algo.entropy_coef; the former name still works"
+
+
+def test_a_former_name_works_in_a_sweep(recwarn, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    trained = []
+    monkeypatch.setattr(train_command, "train", lambda configs: (trained.append(configs[0]), None))
+    monkeypatch.setattr(sys, "argv", ["train"])
+    train_command.main(["-m", "algo.entropy_cost=0,0.25", "updates_per_chunk=3"])
+    assert [config.algo.entropy_coef for config in trained] == [0, 0.25]
+    assert {config.iterations_per_call for config in trained} == {3} and len(renamings(recwarn)) == 2
+
+
+def test_a_former_name_works_in_a_comparison(recwarn, tmp_path):
+    _, planned = planned_runs.plan(["algo.entropy_cost=0,0.25"], ["ppo"], [0], str(tmp_path), "cpu")
+    assert [run.variant for run in planned] == ["ppo_entropy_coef-0", "ppo_entropy_coef-0.25"]
+    assert len(renamings(recwarn)) == 1
+
+
+def test_former_names_in_a_saved_configuration_load_silently_and_a_resumed_run_may_be_given_one(recwarn, tmp_path):
+    config = load_config(["algo.entropy_coef=0.25", "iterations_per_call=3", "checkpoint.every_calls=7"])
+    save_config(config, tmp_path / "config.yaml")
+    saved = (tmp_path / "config.yaml").read_text()
+    for old, new in (
+        ("entropy_cost", "entropy_coef"),
+        ("updates_per_chunk", "iterations_per_call"),
+        ("every_chunks", "every_calls"),
+    ):
+        assert f"{new}:" in saved
+        saved = saved.replace(f"{new}:", f"{old}:")
+    (tmp_path / "config.yaml").write_text(saved)
+    assert read_config(tmp_path / "config.yaml") == config and not renamings(recwarn)
+    resumed = resolve([f"run_dir={tmp_path}", "resume=true", "algo.entropy_cost=0.5", "algo=ppo"])
+    assert resumed.algo.entropy_coef == 0.5 and len(renamings(recwarn)) == 1
+    resumed = resolve([f"run_dir={tmp_path}", "resume=true", "algo.entropy_cost=0.75"])
+    assert resumed.algo.entropy_coef == 0.75 and resumed.iterations_per_call == 3
+
+
+@dataclasses.dataclass
+class ScheduledPPO(PPOConfig):
+    schedule_steps: int = setting(100, only_if={"learning_rate_schedule": AnyBut("constant")})
+
+
+@pytest.fixture
+def scheduled(monkeypatch):
+    """PPO, with a setting that needs another one."""
+    monkeypatch.setitem(ALGORITHMS, "ppo", (ALGORITHMS["ppo"][0], ScheduledPPO))
+    yield
+    monkeypatch.undo()
+    register_schemas()
+
+
+@pytest.mark.usefixtures("scheduled")
+def test_a_given_setting_without_effect_is_refused_unless_a_run_is_resumed(tmp_path, monkeypatch):
+    given, constant, linear = (
+        "algo.schedule_steps=7",
+        "algo.learning_rate_schedule=constant",
+        "algo.learning_rate_schedule=linear",
+    )
+    message = "algo.schedule_steps=7 has no effect with algo.learning_rate_schedule=constant; change that, or leave it"
+    with pytest.raises(UserError, match=message):
+        resolve([given, constant])
+    assert resolve([given, linear]).algo.schedule_steps == 7
+    config = load_config([constant])  # a recipe sets it, which is no mistake
+    assert "algo.schedule_steps" not in training_command(dataclasses.replace(config, seed=1))
+    config.algo.schedule_steps = 7
+    save_config(config, tmp_path / "config.yaml")
+    for further in ([], [given], ["env=humanoid", "algo=ppo", given, constant]):
+        assert resolve([f"run_dir={tmp_path}", "resume=true", *further]).algo.schedule_steps == 7
+
+
+@pytest.mark.usefixtures("scheduled")
+def test_a_job_of_a_sweep_whose_setting_has_no_effect_is_refused(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    trained = []
+    monkeypatch.setattr(train_command, "train", lambda configs: (trained.append(configs[0]), None))
+    monkeypatch.setattr(sys, "argv", ["train"])
+    with pytest.raises(UserError, match="has no effect with"):
+        train_command.main(["-m", "algo.schedule_steps=7", "algo.learning_rate_schedule=linear,constant"])
+    assert [config.algo.learning_rate_schedule for config in trained] == ["linear"]

@@ -121,7 +121,7 @@ def test_signals_finish_the_chunk_save_and_say_how_to_go_on(tmp_path, name):
     process.send_signal(getattr(signal, name))
     out, err = process.communicate(timeout=60)
     assert process.returncode == 128 + getattr(signal, name).value
-    assert f"To go on: python -m mjx_walk.train run_dir={run_dir} resume=true" in out and "Traceback" not in err
+    assert f"To continue: python -m mjx_walk.train run_dir={run_dir} resume=true" in out and "Traceback" not in err
     last = json.loads((run_dir / "metrics.jsonl").read_text().splitlines()[-1])["env_steps"]
     newest = checkpoint.list_steps(run_dir / "checkpoints")[-1]
     assert int(newest.name) == last
@@ -173,7 +173,7 @@ def test_a_longer_schedule_may_be_given_and_its_end_is_told(tmp_path, capsys):
         copy = tmp_path / f"copy_{learns}"
         shutil.copytree(run_dir, copy)
         train_here(copy, "resume=true", f"total_steps={4 * TINY_CHUNK}", *more, tiny=[])
-        assert ("from algo.schedule_steps=128 on the learning rate is zero" in capsys.readouterr().err) == is_told
+        assert ("after algo.schedule_steps=128 the learning rate is zero" in capsys.readouterr().err) == is_told
         assert np.array_equal(leaves(copy, 2)[params], leaves(copy, 4)[params]) != learns
 
 

@@ -1,0 +1,44 @@
+"""What commands print, and where."""
+
+import logging
+import sys
+import warnings
+
+import pytest
+from helpers import TINY, TINY_CHUNK, command_here
+
+import mjx_walk
+from mjx_walk.utils import cli
+
+
+def test_commands_print_messages_without_prefix_and_warnings_in_one_line(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["command", "key=value"])
+
+    def speak(arguments):
+        logging.getLogger("mjx_walk.training").info("%s done", 50)
+        logging.getLogger("mjx_walk.progress").info("5 steps")
+        logging.getLogger("mjx_walk.api").warning("beware")
+        warnings.warn("look out", stacklevel=1)
+        return len(arguments)
+
+    handlers = list(logging.getLogger("mjx_walk").handlers)
+    with pytest.warns(UserWarning, match="look out"), pytest.raises(SystemExit) as ended:
+        cli.main(speak)
+    assert ended.value.code == 1 and logging.getLogger("mjx_walk").handlers == handlers
+    printed = capsys.readouterr()
+    assert printed.out == "50 done\n" and printed.err == "5 steps\nwarning: beware\n"
+
+
+def test_from_python_a_run_is_quiet_and_logs(tmp_path, capfd, caplog):
+    mjx_walk.run([*TINY, f"run_dir={tmp_path}/quiet", f"total_steps={TINY_CHUNK}"])
+    printed = capfd.readouterr()
+    assert "Training" not in printed.out and "steps" not in printed.err
+    with caplog.at_level(logging.INFO, logger="mjx_walk"):
+        mjx_walk.run([*TINY, f"run_dir={tmp_path}/logged", f"total_steps={TINY_CHUNK}"])
+    assert "Training walker2d with ppo on the CPU, physics=c" in caplog.text and "64 steps" in caplog.text
+
+
+def test_a_training_command_shows_messages_and_progress(tmp_path, capfd):
+    assert command_here("train", *TINY, f"run_dir={tmp_path}/run", f"total_steps={TINY_CHUNK}") == 0
+    printed = capfd.readouterr()
+    assert "Training walker2d with ppo on the CPU" in printed.out and "64 steps" in printed.err

@@ -1,0 +1,63 @@
+"""Settings that have no effect under the values of others are refused where a user gives them."""
+
+import dataclasses
+
+import pytest
+
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import AnyBut, has_effect, refuse_ineffective, setting
+
+
+@dataclasses.dataclass
+class Algo:
+    distribution: str = "squashed"
+    state_dependent: bool = setting(False, only_if={"distribution": "normal"})
+    noise: float = setting(1.0, only_if={"state_dependent": False})
+    schedule: str = "constant"
+    last_discount: float | None = None
+    schedule_steps: int = setting(100, only_if={"schedule": AnyBut("constant"), "last_discount": AnyBut(None)})
+    unused: int = setting(1, only_if={})
+
+
+@dataclasses.dataclass
+class Config:
+    seed: int = 0
+    algo: Algo = dataclasses.field(default_factory=Algo)
+
+
+CASES = [
+    (
+        {"noise": 0.5},
+        "algo.noise=0.5 has no effect with algo.distribution=squashed; change that, or leave it out",
+    ),
+    ({"distribution": "normal", "noise": 0.5}, None),
+    (
+        {"distribution": "normal", "state_dependent": True, "noise": 0.5},
+        "algo.noise=0.5 has no effect with algo.state_dependent=true; change that, or leave it out",
+    ),
+    (
+        {"schedule_steps": 7},
+        "algo.schedule_steps=7 has no effect with algo.schedule=constant and algo.last_discount=null; "
+        "change that, or leave it out",
+    ),
+    ({"schedule_steps": 7, "last_discount": 0.0}, None),
+    ({"schedule_steps": 7, "schedule": "linear"}, None),
+    ({"unused": 2}, "algo.unused=2 has no effect here; leave it out"),
+]
+
+
+@pytest.mark.parametrize(("values", "message"), CASES)
+def test_a_given_setting_without_effect_is_refused(values, message):
+    config = Config(algo=Algo(**values))
+    keys = ["seed", "env", "algo", "algo.unknown", "nowhere.seed", *(f"algo.{name}" for name in values)]
+    if message is None:
+        refuse_ineffective(config, keys)
+        return
+    with pytest.raises(UserError) as error:
+        refuse_ineffective(config, keys)
+    assert str(error.value) == message
+
+
+def test_settings_that_are_not_given_are_not_refused():
+    refuse_ineffective(Config(algo=Algo(noise=0.5, unused=2)), ["seed"])
+    assert not has_effect(Config(), "algo.noise") and has_effect(Config(), "algo.distribution")
