@@ -38,7 +38,7 @@ def test_parity_of_all_versions(name, version, physics):
 
 
 def test_parity_where_new_memory_holds_no_zeros():
-    """On a CPU, reductions over a batch of this size read memory that was never written, without `xla_flags`."""
+    """On a CPU, reductions over a batch of this size read memory that was never written, without the flag that `prepare_jax` sets."""
     sizes = ("env=humanoid_standup", "copies=48", "steps=120")
     done = command("parity", "physics=jax", *sizes, env=AS_A_USER | {"MALLOC_PERTURB_": "128"})
     assert done.returncode == 0, done.stdout

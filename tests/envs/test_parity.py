@@ -51,7 +51,7 @@ def test_a_steep_capsule_slides_as_in_c(physics, tilt):
 
 
 def test_the_compiler_reduces_a_large_batch_right():
-    """The premise of every other test here; without the flag of `xla_flags`, JAX 0.10.2 fails it on a CPU."""
+    """The premise of every other test here; without the flag that `prepare_jax` sets, JAX 0.10.2 fails it on a CPU."""
     rows = jnp.zeros((40_000, 3)).at[:, 0].set(jnp.arange(40_000.0))
     found = jax.jit(jax.vmap(lambda row: jnp.sum((jnp.eye(3) @ row) ** 2)))(rows)
     np.testing.assert_allclose(found, np.arange(40_000.0) ** 2, rtol=1e-6)

@@ -8,8 +8,8 @@ import pytest
 from mjx_walk.algos import make_algorithm
 from mjx_walk.api import make_task
 from mjx_walk.evaluation.gymnasium_scores import Scores
+from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import load_config
-from mjx_walk.runs.policies import load_best_policy
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.training.recorder import Recorder
 
@@ -42,7 +42,7 @@ def with_best(algorithm, state, best_return, best_iteration):
 
 
 def kept(folder, algorithm, state):
-    return load_best_policy(folder, algorithm.policy_params(state))
+    return checkpoint.restore(folder.best_policy, algorithm.policy_params(state))
 
 
 def assert_same(found, expected):
@@ -83,7 +83,7 @@ def test_of_the_last_policy_and_the_best_one_gymnasium_chooses(run, monkeypatch,
         return Scores(np.full(num_episodes, best if is_best else last), np.full(num_episodes, 3), [0], "Walker2d-v5")
 
     monkeypatch.setattr(recorder, "_score_in_gymnasium", score)
-    monkeypatch.setattr("mjx_walk.plots.plot_run", lambda folder: None)
+    monkeypatch.setattr("mjx_walk.viewing.curves.plot_run", lambda folder: None)
     recorder.begin(0, trains_on=True)
     recorder.end(state, env_steps=80)
     scores = recorder.score(wall_seconds=1.0)
