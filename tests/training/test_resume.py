@@ -92,7 +92,7 @@ def test_a_replay_that_is_gone_is_filled_again(tmp_path):
     done = train(tmp_path / "run", "algo=sac", f"total_steps={6 * TINY_CHUNK}", "resume=true", tiny=TINY_OFF_POLICY)
     assert "has no replay any more; it is filled again" in done.stderr
     after = leaves(tmp_path / "run", 6)
-    assert after["replay.rows"] == 16 and after["updates"] == 48
+    assert after["replay.rows"] == 16 and after["iterations"] == 48
     # Two chunks of eight updates, the first seven of which wait for 64 transitions.
     assert after["critic_updates"] - before["critic_updates"] == 2 * (16 - 7)
 
@@ -213,7 +213,7 @@ def test_a_save_that_is_cut_short_has_kept_the_best_policy(tmp_path, monkeypatch
 
 
 def test_a_gymnasium_process_whose_parent_is_gone_ends_quietly():
-    worker = start_module("gymnasium_worker", stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    worker = start_module("evaluation.gymnasium_worker", stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     pickle.dump(("Walker2d-v5", {}, [0]), worker.stdin)
     worker.stdin.flush()
     assert pickle.load(worker.stdout).shape == (1, 17)
