@@ -23,7 +23,7 @@ from mjx_walk.algos import Algorithm, TrainState
 from mjx_walk.training.programs import Program, Step, make_axis_program, make_init
 from mjx_walk.utils import collectives
 from mjx_walk.utils.collectives import DEVICES
-from mjx_walk.utils.types import Metric, Metrics, Reduction, has_mark
+from mjx_walk.utils.types import Metric, Metrics, Reduction, map_marked
 
 _PATH_BYTES = 4096
 _TIMEOUT = 3600
@@ -109,8 +109,7 @@ def make_devices_program(algorithm: Algorithm, processes: Processes, iterations_
 def _init_on_device(algorithm: Algorithm, process_index: int, key: jax.Array) -> TrainState:
     """The state of a device. Leaves that each device has its own of start from a key of its own."""
     shared, own = algorithm.init(key), algorithm.init(jax.random.fold_in(key, process_index))
-    is_own = has_mark(shared, "per_device")
-    return _expand(jax.tree.map(lambda mark, a, b: a if mark else b, is_own, own, shared))
+    return _expand(map_marked(lambda _, leaf: leaf, "per_device", shared, own))
 
 
 def _make_step(algorithm: Algorithm, processes: Processes, iterations_per_call: int) -> Step:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from mjx_walk.algos import TrainState
 from mjx_walk.runs import checkpoint
 from mjx_walk.training.distributed import Processes
-from mjx_walk.utils.types import has_mark
+from mjx_walk.utils.types import map_marked
 
 NUM_DEVICES = "num_devices"
 """Key of a checkpoint's facts: the number of devices that saved it."""
@@ -41,8 +41,7 @@ def restore_newest(checkpoints: Path, like: TrainState, processes: Processes) ->
     state, facts = checkpoint.restore_newest(checkpoints, like, part, agree)
     former_count = facts.get(NUM_DEVICES, 1)
     if index >= former_count:
-        is_key = has_mark(state, "random_key")
-        state = jax.tree.map(lambda mark, x: jax.random.fold_in(x, index) if mark else x, is_key, state)
+        state = map_marked(lambda key: jax.random.fold_in(key, index), "random_key", state)
     if former_count != count:
         state = _rescale_counts(state, former_count, count)
     return state, facts
@@ -50,5 +49,4 @@ def restore_newest(checkpoints: Path, like: TrainState, processes: Processes) ->
 
 def _rescale_counts(state: TrainState, former_count: int, count: int) -> TrainState:
     """Iteration counts for another number of devices: the more devices, the fewer iterations for the same steps."""
-    is_count = has_mark(state, "iteration_count")
-    return jax.tree.map(lambda mark, x: jnp.int32(x * former_count // count) if mark else x, is_count, state)
+    return map_marked(lambda number: jnp.int32(number * former_count // count), "iteration_count", state)

@@ -20,7 +20,8 @@ __all__ = [
     "Reduction",
     "Transition",
     "as_means",
-    "has_mark",
+    "map_marked",
+    "mark_flags",
 ]
 
 PolicyFn = Callable[[jax.Array, jax.Array], jax.Array]
@@ -67,18 +68,25 @@ ITERATION_COUNT = {"iteration_count": True}
 """A count of iterations, whose environment steps depend on the number of devices."""
 
 
-def has_mark(tree: Any, mark: str) -> Any:
-    """A pytree of bools, one for each leaf: whether its field, or one around it, has the mark."""
-
-    def of_node(node: Any) -> Any:
+def mark_flags(tree: Any, mark: str) -> list[bool]:
+    """For each leaf of a pytree, in order: whether its field, or a field around it, has the mark."""
+    flags: list[bool] = []
+    for node in jax.tree.leaves(tree, is_leaf=dataclasses.is_dataclass):
         if not dataclasses.is_dataclass(node):
-            return False
-        found = {}
+            flags.append(False)
+            continue
         for field in dataclasses.fields(node):
             if field.metadata.get("pytree_node", True):
                 value = getattr(node, field.name)
                 is_marked = field.metadata.get(mark, False)
-                found[field.name] = jax.tree.map(lambda _: True, value) if is_marked else has_mark(value, mark)
-        return dataclasses.replace(node, **found)  # type: ignore[type-var]
+                flags += [True] * len(jax.tree.leaves(value)) if is_marked else mark_flags(value, mark)
+    return flags
 
-    return jax.tree.map(of_node, tree, is_leaf=dataclasses.is_dataclass)
+
+def map_marked(function: Callable[..., Any], mark: str, tree: Any, *others: Any) -> Any:
+    """Apply a function to the leaves that have a mark, and keep the other leaves of the first tree."""
+    leaves, structure = jax.tree.flatten(tree)
+    columns = zip(leaves, *map(jax.tree.leaves, others), strict=True)
+    flags = mark_flags(tree, mark)
+    new = [function(*column) if flag else column[0] for flag, column in zip(flags, columns, strict=True)]
+    return jax.tree.unflatten(structure, new)

@@ -27,7 +27,7 @@ from mjx_walk.training.distributed_checkpoint import restore_newest
 from mjx_walk.training.programs import make_init
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.types import has_mark
+from mjx_walk.utils.types import mark_flags
 
 KEY = jax.random.PRNGKey(0)
 CHUNK = 2 * TINY_CHUNK
@@ -147,8 +147,8 @@ def own_leaves(tiny):
     """Whether each leaf of the TrainState is marked as a device's own, by its path."""
     config = load_config([*tiny, "hardware=cpu"])
     algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
-    marks = has_mark(jax.eval_shape(algorithm.init, KEY), "per_device")
-    return checkpoint._named_leaves(marks)
+    shapes = jax.eval_shape(algorithm.init, KEY)
+    return dict(zip(checkpoint._named_leaves(shapes), mark_flags(shapes, "per_device"), strict=True))
 
 
 @pytest.mark.slow

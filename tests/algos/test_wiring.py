@@ -1,0 +1,123 @@
+"""Each setting of each algorithm reaches what the algorithm computes.
+
+Two programs are traced for each setting, without being compiled: an iteration under the algorithm's base configuration,
+and one with the setting changed. Dead code is removed, so a setting that is read but affects no output leaves the
+program as it was.
+"""
+
+import dataclasses
+import functools
+import re
+
+import jax
+import numpy as np
+import pytest
+from jax.interpreters import partial_eval
+from toy_tasks import EndlessReward
+
+from mjx_walk.algos import ALGORITHMS, make_algorithm
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+
+ON_POLICY = ("ppo", "a2c", "reinforce")
+_SMALL_ON_POLICY = {
+    "unroll_length": 4,
+    "num_unrolls": 1,
+    "normalizer_warmup_steps_per_env": 4,
+    "num_minibatches": 2,
+    "max_tail_discount": 0.95,
+    "policy_hidden_layer_sizes": (4,),
+    "value_hidden_layer_sizes": (4,),
+}
+_SMALL_OFF_POLICY = {
+    "unroll_length": 2,
+    "grad_updates_per_step": 1,
+    "policy_delay": 1,
+    "batch_size": 4,
+    "replay_capacity": 64,
+    "learning_starts": 8,
+    "policy_hidden_layer_sizes": (4,),
+    "critic_hidden_layer_sizes": (4,),
+}
+BASE = {algo: _SMALL_ON_POLICY if algo in ON_POLICY else _SMALL_OFF_POLICY for algo in ALGORITHMS}
+"""Settings that make an iteration small, as far as an algorithm has them."""
+CHANGES = {
+    "distribution": {"tanh_normal": "normal", "normal": "tanh_normal"},
+    "activation": {"swish": "tanh", "relu": "tanh"},
+    "target_entropy": {-0.5: -0.7},
+    "normalized_return_max": {None: 3.0, 5.0: 3.0},
+    "max_value_grad_norm": {None: 0.5},
+    "max_grad_norm": {None: 0.5},
+    "final_discount": {None: 0.9},
+    "final_target_entropy": {None: -1.0},
+    "policy_delay": {1: 2},
+    "learning_starts": {8: 16},
+    "replay_capacity": {64: 128},
+    "ou_noise_std": {0.0: 0.1},
+    "max_tail_discount": {0.95: 0.5},
+}
+"""New values by name and base value, where `changed` has no rule."""
+NEEDS = {
+    "target_kl": {"learning_rate_schedule": "adaptive_kl"},
+    "init_noise_std": {"distribution": "normal"},
+    "state_dependent_std": {"distribution": "normal"},
+    "min_log_std": {"distribution": "normal"},
+    "max_log_std": {"distribution": "normal"},
+    "schedule_steps": {"learning_rate_schedule": "linear"},
+    "normalized_return_max": {"normalize_rewards": True},
+    "ou_noise_theta": {"ou_noise_std": 0.1},
+}
+"""Other settings without which a setting has no effect."""
+NO_EFFECT = {
+    **{(algo, "name"): "it selects the algorithm" for algo in ALGORITHMS},
+    **{
+        ("reinforce", name): "REINFORCE has no value network"
+        for name in ("gae_lambda", "value_loss_coef", "value_hidden_layer_sizes")
+    },
+}
+"""Settings that change no computation, and why."""
+CASES = [(algo, field.name) for algo, (_, config) in ALGORITHMS.items() for field in dataclasses.fields(config)]
+
+
+def base_settings(algo, **further):
+    names = {field.name for field in dataclasses.fields(ALGORITHMS[algo][1])}
+    return {name: value for name, value in BASE[algo].items() if name in names} | further
+
+
+def changed(name, value):
+    """Another valid value of a setting."""
+    if name in CHANGES:
+        return CHANGES[name][value]
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, str):
+        choices = next(
+            f.metadata["choices"] for _, c in ALGORITHMS.values() for f in dataclasses.fields(c) if f.name == name
+        )
+        return next(choice for choice in choices if choice != value)
+    if isinstance(value, tuple):
+        return (5,)
+    return 2 * value if isinstance(value, int) else 0.9 * value
+
+
+@functools.cache
+def base_program(algo, needs):
+    return program(algo, **dict(needs))
+
+
+def program(algo, **settings):
+    """The text of an iteration from a key to the state and the metrics, without dead code, and its constants."""
+    config = ALGORITHMS[algo][1](**base_settings(algo, **settings))
+    algorithm = make_algorithm(EndlessReward(), 4, EvaluationConfig(1), config)
+    traced = jax.make_jaxpr(lambda key: algorithm.learn(*algorithm.collect(algorithm.init(key))))(jax.random.PRNGKey(0))
+    jaxpr, _used = partial_eval.dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars))
+    constants = [np.asarray(x).tobytes() for x in jax.tree.leaves(traced.consts)]
+    return re.sub(r"0x[0-9a-f]+", "", str(jaxpr)), constants
+
+
+@pytest.mark.parametrize(("algo", "name"), CASES, ids=[f"{algo}-{name}" for algo, name in CASES])
+def test_a_setting_changes_the_program(algo, name):
+    needs = NEEDS.get(name, {})
+    config = ALGORITHMS[algo][1](**base_settings(algo, **needs))
+    value = changed(name, getattr(config, name)) if (algo, name) not in NO_EFFECT else getattr(config, name)
+    is_same = program(algo, **needs | {name: value}) == base_program(algo, tuple(needs.items()))
+    assert is_same is ((algo, name) in NO_EFFECT)
