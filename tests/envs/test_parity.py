@@ -6,10 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjx_walk import parity as parity_command
 from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.physics import PhysicsState, make_engine, mjx_warp
 from mjx_walk.evaluation import parity
 from mjx_walk.utils.compat import prepare_jax
+from mjx_walk.utils.errors import UserError
 
 prepare_jax()  # before any test of this process starts JAX
 
@@ -67,6 +69,15 @@ def test_a_wrong_engine_is_noticed():
     expected = parity.one_step(reference, states, actions)
     assert parity.compare(reference, expected, parity.one_step(reference, states, actions)).is_within
     assert not parity.compare(reference, expected, parity.one_step(wrong, states, actions)).is_within
+
+
+def test_copies_is_read_as_num_envs_with_one_warning():
+    with (
+        pytest.warns(UserWarning, match="copies is now num_envs") as warned,
+        pytest.raises(UserError, match="num_envs=2:"),
+    ):
+        parity_command.main(["copies=2", "env=walker2d"])
+    assert len(warned) == 1
 
 
 @pytest.mark.parametrize("physics", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
