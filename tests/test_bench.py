@@ -39,7 +39,7 @@ def test_bench_measures_and_writes(tmp_path, algo, tiny, sizes):
 
 def test_a_mistake_in_the_settings_costs_one_line(capsys):
     assert command_here("bench", "env=walker2d", "num_envs=3") == 2
-    assert capsys.readouterr().err.startswith("error: num_envs=3 times algo.num_unrolls=1 does not divide")
+    assert capsys.readouterr().err.startswith("error: num_envs=3 times algo.num_unrolls=1 must be a multiple of")
 
 
 def test_devices_are_doubled_up_to_those_asked_for(capsys):

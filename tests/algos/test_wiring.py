@@ -53,7 +53,7 @@ CHANGES = {
     "learning_starts": {8: 16},
     "replay_capacity": {64: 128},
     "ou_noise_std": {0.0: 0.1},
-    "max_tail_discount": {0.95: 0.5},
+    "max_tail_discount": {0.95: 0.93},
 }
 """New values by name and base value, where `changed` has no rule."""
 NEEDS = {
@@ -73,6 +73,7 @@ NO_EFFECT = {
         ("reinforce", name): "REINFORCE has no value network"
         for name in ("gae_lambda", "value_loss_coef", "value_hidden_layer_sizes")
     },
+    ("reinforce", "normalize_advantages"): "REINFORCE always normalises them",
 }
 """Settings that change no computation, and why."""
 CASES = [(algo, field.name) for algo, (_, config) in ALGORITHMS.items() for field in dataclasses.fields(config)]
