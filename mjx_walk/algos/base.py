@@ -67,6 +67,18 @@ class Algorithm(abc.ABC):
         """Memory of the replay, if there is one."""
         return 0
 
+    def start_iteration(self, state: TrainState, pool_key: jax.Array) -> tuple[VectorState, InlineEvaluation, Metrics]:
+        """Renew the pool of random starts, and start the next evaluation round if one has ended.
+
+        Returns:
+            The environments, the evaluation, and the scores of `InlineEvaluator.next_round`.
+        """
+        env = self.env.renew_pool(state.env, pool_key)
+        evaluation, scores = self.evaluator.next_round(
+            state.evaluation, self.policy_params(state), state.iterations, env.pool
+        )
+        return env, evaluation, scores
+
     @abc.abstractmethod
     def init(self, key: jax.Array) -> Any:
         """The `TrainState` before the first iteration."""

@@ -12,7 +12,7 @@ from brax.training.networks import FeedForwardNetwork
 
 from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm, OffPolicyConfig
 from mjx_walk.common import networks
-from mjx_walk.common.optimizers import apply_gradients, make_adam, polyak_update
+from mjx_walk.common.optimizers import polyak_update
 from mjx_walk.utils.settings import setting
 
 
@@ -46,7 +46,6 @@ class DeterministicAlgorithm(OffPolicyAlgorithm):
     config: DeterministicConfig
     policy_network: FeedForwardNetwork = dataclasses.field(init=False, repr=False)
     critic_network: FeedForwardNetwork = dataclasses.field(init=False, repr=False)
-    optimizer: optax.GradientTransformation = dataclasses.field(init=False, repr=False)
     exploration_noise: jax.Array = dataclasses.field(init=False, repr=False)
     """`[B, 1]`: standard deviation of each environment's noise."""
 
@@ -58,7 +57,6 @@ class DeterministicAlgorithm(OffPolicyAlgorithm):
         self._set(
             policy_network=policy,
             critic_network=critic,
-            optimizer=make_adam(config.max_grad_norm),
             exploration_noise=noise,
         )
 
@@ -118,9 +116,7 @@ class DeterministicAlgorithm(OffPolicyAlgorithm):
         target = self.critic_target(learner, batch, key)
         (loss, value), grads = jax.value_and_grad(self.critic_loss, has_aux=True)(learner.critic, target, batch)
         rate = self.config.critic_learning_rate * batch.rate_factor
-        critic, critic_optimizer = apply_gradients(
-            self.optimizer, learner.critic, grads, learner.critic_optimizer, rate, self.axis_name
-        )
+        critic, critic_optimizer = self.apply_gradients(learner.critic, grads, learner.critic_optimizer, rate)
         metrics = {"critic_loss": loss, "critic_value": value, "critic_grad_norm": optax.global_norm(grads)}
         return learner.replace(critic=critic, critic_optimizer=critic_optimizer), metrics
 
@@ -130,9 +126,7 @@ class DeterministicAlgorithm(OffPolicyAlgorithm):
         learner, metrics = self.critic_update(learner, batch, key)
         loss, grads = jax.value_and_grad(self.policy_loss)(learner.policy, learner.critic, batch)
         rate = self.config.policy_learning_rate * batch.rate_factor
-        policy, policy_optimizer = apply_gradients(
-            self.optimizer, learner.policy, grads, learner.policy_optimizer, rate, self.axis_name
-        )
+        policy, policy_optimizer = self.apply_gradients(learner.policy, grads, learner.policy_optimizer, rate)
         learner = learner.replace(
             policy=policy,
             policy_optimizer=policy_optimizer,

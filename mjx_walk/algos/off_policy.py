@@ -8,13 +8,20 @@ from typing import Any, NamedTuple
 import flax
 import jax
 import jax.numpy as jnp
+import optax
 from brax.training.acme import running_statistics
 from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.networks import ACTIVATION
 
 from mjx_walk.algos.base import Algorithm, TrainState
 from mjx_walk.common import networks, returns, rollout
-from mjx_walk.common.optimizers import anneal_discount, remaining_fraction, schedule_factor
+from mjx_walk.common.optimizers import (
+    anneal_discount,
+    apply_gradients,
+    make_adam,
+    remaining_fraction,
+    schedule_factor,
+)
 from mjx_walk.common.replay_buffer import Replay, ReplayBuffer, Steps
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
@@ -109,6 +116,7 @@ class OffPolicyAlgorithm(Algorithm):
 
     config: OffPolicyConfig
     buffer: ReplayBuffer = dataclasses.field(init=False, repr=False)
+    optimizer: optax.GradientTransformation = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         config = self.config
@@ -128,6 +136,7 @@ class OffPolicyAlgorithm(Algorithm):
                 f"algo.learning_starts={config.learning_starts} is more than "
                 f"algo.replay_capacity={config.replay_capacity}"
             )
+        self._set(optimizer=make_adam(config.max_grad_norm))
         super().__post_init__()
 
     # What an algorithm defines.
@@ -172,6 +181,12 @@ class OffPolicyAlgorithm(Algorithm):
     def replay_bytes(self) -> int:
         return self.buffer.num_bytes
 
+    def apply_gradients(
+        self, params: Any, grads: Any, optimizer: optax.OptState, rate: jax.Array | float
+    ) -> tuple[Any, optax.OptState]:
+        """One gradient step: parameters and optimizer state after it."""
+        return apply_gradients(self.optimizer, params, grads, optimizer, rate, self.axis_name)
+
     def normalize(self, normalizer: RunningStatisticsState, obs: jax.Array) -> jax.Array:
         """Normalised and clipped observations."""
         return running_statistics.normalize(obs, normalizer, max_abs_value=self.config.observation_clip)
@@ -184,7 +199,7 @@ class OffPolicyAlgorithm(Algorithm):
 
         def act(obs: jax.Array, key: jax.Array) -> jax.Array:
             action = self.act(params, self.normalize(normalizer, obs), key, deterministic)
-            return networks.to_env_action(self.task, action)
+            return self.task.scale_action(action)
 
         return act
 
@@ -211,10 +226,7 @@ class OffPolicyAlgorithm(Algorithm):
         key, pool_key = jax.random.split(state.key)
         step = state.iterations * config.unroll_length + jnp.arange(config.unroll_length)
         noise_keys = jax.vmap(jax.random.fold_in, (None, 0))(state.noise_key, step // config.noise_repeat)
-        env = self.env.renew_pool(state.env, pool_key)
-        evaluation, scores = self.evaluator.next_round(
-            state.evaluation, self.policy_params(state), state.iterations, env.pool
-        )
+        env, evaluation, scores = self.start_iteration(state, pool_key)
         actor = functools.partial(self._explore, state)
         env, evaluation, steps, metrics = rollout.unroll(self.env, env, evaluation, actor, noise_keys, _keep)
         return state.replace(env=env, evaluation=evaluation, key=key), (steps, metrics | scores)
@@ -226,7 +238,7 @@ class OffPolicyAlgorithm(Algorithm):
         chosen = self.explore(state.learner.policy, self.normalize(state.normalizer, obs), explore_key)
         uniform = jax.random.uniform(uniform_key, chosen.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(is_random, uniform, chosen)
-        return networks.to_env_action(self.task, action), action
+        return self.task.scale_action(action), action
 
     def learn(self, state: OffPolicyState, batch: tuple[Steps, Metrics]) -> tuple[OffPolicyState, Metrics]:
         config = self.config

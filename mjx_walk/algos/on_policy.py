@@ -146,7 +146,7 @@ class OnPolicyAlgorithm(Algorithm):
 
     def policy(self, policy_params: Any, deterministic: bool = True) -> PolicyFn:
         act = brax_ppo_networks.make_inference_fn(self.nets)(policy_params, deterministic=deterministic)
-        return lambda obs, key: networks.to_env_action(self.task, act(obs, key)[0])
+        return lambda obs, key: self.task.scale_action(act(obs, key)[0])
 
     def init(self, key: jax.Array) -> OnPolicyState:
         policy_key, value_key, env_key, key = jax.random.split(key, 4)
@@ -184,10 +184,7 @@ class OnPolicyAlgorithm(Algorithm):
             env, evaluation, kept, metrics = rollout.unroll(self.env, env, evaluation, actor, inputs, keep)
             return (env, evaluation, exploration), (*kept, env.env.obs, metrics)
 
-        env = self.env.renew_pool(state.env, pool_key)
-        evaluation, scores = self.evaluator.next_round(
-            state.evaluation, self.policy_params(state), state.iterations, env.pool
-        )
+        env, evaluation, scores = self.start_iteration(state, pool_key)
         carry = (env, evaluation, state.exploration)
         (env, evaluation, exploration), (transitions, reward, done, last_obs, metrics) = jax.lax.scan(
             unroll, carry, jax.random.split(run_key, config.num_unrolls)
@@ -213,7 +210,7 @@ class OnPolicyAlgorithm(Algorithm):
         """Gymnasium's action, with exploration noise, and what the loss needs of the sample."""
         key, noise = inputs
         action, extras = sample(obs, key)
-        return networks.to_env_action(self.task, action + noise), extras
+        return self.task.scale_action(action + noise), extras
 
     def _keep(
         self, state: OnPolicyState, reward_scale: jax.Array, step: rollout.Step

@@ -13,7 +13,7 @@ from brax.training.agents.sac.networks import SACNetworks
 from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm, OffPolicyConfig
 from mjx_walk.common import networks
 from mjx_walk.common.brax_losses import SACLosses, make_sac_losses
-from mjx_walk.common.optimizers import apply_gradients, make_adam, polyak_update
+from mjx_walk.common.optimizers import polyak_update
 from mjx_walk.utils.settings import setting
 
 
@@ -50,11 +50,10 @@ class SAC(OffPolicyAlgorithm):
 
     config: SACConfig
     nets: SACNetworks = dataclasses.field(init=False, repr=False)
-    optimizer: optax.GradientTransformation = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set(nets=self.make_networks(), optimizer=make_adam(self.config.max_grad_norm))
+        self._set(nets=self.make_networks())
 
     def make_networks(self) -> SACNetworks:
         """Policy and critics."""
@@ -97,9 +96,7 @@ class SAC(OffPolicyAlgorithm):
     def critic_update(self, learner: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, dict[str, jax.Array]]:
         loss, grads = jax.value_and_grad(self.critic_loss)(learner.critic, learner, batch, key)
         rate = self.config.critic_learning_rate * batch.rate_factor
-        critic, critic_optimizer = apply_gradients(
-            self.optimizer, learner.critic, grads, learner.critic_optimizer, rate, self.axis_name
-        )
+        critic, critic_optimizer = self.apply_gradients(learner.critic, grads, learner.critic_optimizer, rate)
         new_learner = learner.replace(
             critic=critic,
             critic_optimizer=critic_optimizer,
@@ -115,18 +112,11 @@ class SAC(OffPolicyAlgorithm):
             learner.policy, learner.critic, jnp.exp(learner.log_alpha), batch.transitions, policy_key
         )
         new_learner, metrics = self.critic_update(learner, batch, critic_key)
-        log_alpha, alpha_optimizer = apply_gradients(
-            self.optimizer,
-            learner.log_alpha,
-            alpha_grad,
-            learner.alpha_optimizer,
-            config.alpha_learning_rate,
-            self.axis_name,
+        log_alpha, alpha_optimizer = self.apply_gradients(
+            learner.log_alpha, alpha_grad, learner.alpha_optimizer, config.alpha_learning_rate
         )
         rate = config.policy_learning_rate * batch.rate_factor
-        policy, policy_optimizer = apply_gradients(
-            self.optimizer, learner.policy, grads, learner.policy_optimizer, rate, self.axis_name
-        )
+        policy, policy_optimizer = self.apply_gradients(learner.policy, grads, learner.policy_optimizer, rate)
         new_learner = new_learner.replace(
             policy=policy, policy_optimizer=policy_optimizer, log_alpha=log_alpha, alpha_optimizer=alpha_optimizer
         )

@@ -176,9 +176,3 @@ def update_normalizer(
 ) -> running_statistics.RunningStatisticsState:
     """Add `[…, observation_size]` observations, those of all devices, to the running statistics."""
     return running_statistics.update(normalizer, obs, std_min_value=MIN_OBSERVATION_STD, pmap_axis_name=axis_name)
-
-
-def to_env_action(task: Task, action: jax.Array) -> jax.Array:
-    """From the networks' `[-1, 1]` to Gymnasium's units; an unbounded Gaussian's samples are clipped first."""
-    center = (task.action_high + task.action_low) / 2
-    return center + (task.action_high - task.action_low) / 2 * jnp.clip(action, -1.0, 1.0)

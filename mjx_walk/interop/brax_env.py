@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 from brax.envs import base
 
-from mjx_walk.common.networks import to_env_action
 from mjx_walk.envs import NO_TIME_LIMIT, make_env
 
 
@@ -35,7 +34,7 @@ class BraxEnv(base.Env):
 
     def step(self, state: base.State, action: jax.Array) -> base.State:
         """Step once. `done` means that the task ended the episode; the time limit never sets it."""
-        after = self._task.step(state.pipeline_state, to_env_action(self._task, action))
+        after = self._task.step(state.pipeline_state, self._task.scale_action(action))
         return state.replace(
             pipeline_state=after,
             obs=after.obs,

@@ -123,7 +123,7 @@ def further_cases() -> list[Case]:
         for engine in ("jax", "warp")
     ]
     for algo in (*ON_POLICY, "csac", "td3"):
-        cases.append(_case(f"{algo}-seeds", algo, *_ALL[algo], "seed=", "seeds=2"))
+        cases.append(_case(f"{algo}-seeds", algo, *_ALL[algo], "seed=", "seeds=[2,1]" if algo == "csac" else "seeds=2"))
     for algo in ("ppo", "a2c", "csac"):
         cases.append(_case(f"{algo}-devices", algo, *_ALL[algo], "devices=2", num_devices=2))
     cases.append(

@@ -166,10 +166,8 @@ def read_arrays(folder: Path) -> dict[str, np.ndarray]:
 def _renamed(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Leaves of the reference under their present names."""
     sys.path.insert(0, str(TREE))
-    try:
-        from mjx_walk.runs.checkpoint import present_name
-    except ImportError:
-        return arrays
+    from mjx_walk.runs.checkpoint import present_name
+
     return {present_name(name): array for name, array in arrays.items()}
 
 
