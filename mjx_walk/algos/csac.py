@@ -21,11 +21,12 @@ from mjx_walk.utils.settings import setting
 
 @dataclasses.dataclass
 class CSACConfig(SACConfig):
-    """Settings of categorical SAC; the recipe of each task changes some of them."""
+    """Settings of categorical SAC."""
 
     name: str = setting("csac", choices=("csac",))
     num_atoms: int = setting(101, at_least=2)
-    """Returns that the critics tell apart, evenly spaced from `-normalized_return_max` to `normalized_return_max`."""
+    """Atoms of the return distribution, evenly spaced from `-normalized_return_max` to `normalized_return_max`; the
+    latter is v_max in C51."""
     normalize_rewards: bool = True
     normalized_return_max: float | None = setting(5.0, above=0)
 
@@ -82,15 +83,15 @@ class CSAC(SAC):
 
 
 def project(probs: jax.Array, positions: jax.Array, atoms: jax.Array) -> jax.Array:
-    """Share the mass at each position among the two atoms beside it; what lies outside goes to the outermost.
+    """Distribute the mass at each position over its two neighbouring atoms; mass outside goes to the outermost atoms.
 
     Args:
         probs: `[B, A]`.
-        positions: `[B, A]`, where that mass lies.
+        positions: `[B, A]`, the positions of the mass.
         atoms: `[A]`, evenly spaced.
 
     Returns:
-        Probabilities of the atoms, `[B, A]`, with the mean of what lay inside.
+        Probabilities of the atoms, `[B, A]`. The mean is preserved where no mass lies outside.
     """
     spacing = atoms[1] - atoms[0]
     positions = jnp.clip(positions, atoms[0], atoms[-1])

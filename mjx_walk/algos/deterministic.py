@@ -21,9 +21,9 @@ class DeterministicConfig(OffPolicyConfig):
     """Settings that TD3 and DDPG share."""
 
     min_exploration_noise: float = setting(0.1, at_least=0)
-    """Std of the Gaussian noise on the first copy's actions, in the networks' `[-1, 1]`."""
+    """Std of the Gaussian noise on the first environment's actions, in `[-1, 1]`."""
     max_exploration_noise: float = setting(0.1, at_least=0)
-    """On the last copy's; evenly spaced between, so that some copies explore and some stay near the policy."""
+    """Std for the last environment, evenly spaced in between: some environments explore, some stay near the policy."""
 
 
 class DeterministicState(flax.struct.PyTreeNode):
@@ -39,7 +39,10 @@ class DeterministicState(flax.struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DeterministicAlgorithm(OffPolicyAlgorithm):
-    """Source: Fujimoto et al. 2018, algorithm 1: both targets move when the policy does."""
+    """A deterministic policy, and critics whose minimum is the target.
+
+    Source: Fujimoto et al. 2018, algorithm 1: both targets move when the policy does.
+    """
 
     num_critics: ClassVar[int]
 

@@ -33,30 +33,30 @@ class OffPolicyConfig:
     """Settings that all off-policy algorithms have."""
 
     unroll_length: int = setting(4, at_least=1)
-    """Steps of all copies between two phases of learning."""
+    """Steps of all environments between two phases of learning."""
     grad_updates_per_step: int = setting(8, at_least=1)
-    """Critic updates for each step of all copies."""
+    """Critic updates for each step of all environments. The update-to-data ratio is this divided by `num_envs`."""
     policy_delay: int = setting(1, at_least=1)
     """Critic updates for each policy update."""
     batch_size: int = setting(4096, at_least=1)
     replay_capacity: int = setting(1_000_000, at_least=1)
     """Transitions, rounded up to whole unrolls."""
     replay_dtype: str = setting("float32", choices=("float32", "bfloat16"))
-    """Of the observations stored."""
+    """Dtype of the stored observations."""
     learning_starts: int = setting(10_000, at_least=0)
-    """Environment steps under uniformly random actions, before learning begins."""
+    """Environment steps with uniformly random actions, before learning starts."""
     noise_repeat: int = setting(1, at_least=1)
-    """Steps that the same draw of exploration noise is kept for."""
+    """Steps for which a sample of exploration noise is kept."""
     n_step: int = setting(1, at_least=1)
     discount: float = setting(0.99, at_least=0, at_most=1)
     final_discount: float | None = setting(None, at_least=0, below=1)
-    """What it becomes over `schedule_steps`: its horizon 1 / (1 - γ) changes by the same factor every step."""
+    """Discount after `schedule_steps`. The horizon 1 / (1 - γ) changes by the same factor at every step."""
     tau: float = setting(0.005, above=0, at_most=1)
-    """How far target networks move at each update of theirs."""
+    """Fraction by which target networks move at each update."""
     policy_learning_rate: float = setting(3e-4, above=0)
     critic_learning_rate: float = setting(3e-4, above=0)
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear"))
-    """`linear`: to zero over `schedule_steps`."""
+    """`linear`: falls to zero over `schedule_steps`."""
     schedule_steps: int = setting(100_000_000, at_least=1)
     """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
     max_grad_norm: float | None = setting(None, above=0)
@@ -64,7 +64,7 @@ class OffPolicyConfig:
     normalize_rewards: bool = False
     """Divide rewards by the running std of the discounted return, before `reward_scale`."""
     normalized_return_max: float | None = setting(None, above=0)
-    """Divide them by more, if it takes that to keep every discounted return seen within this."""
+    """Upper bound of normalised returns: rewards are divided by more where a return seen so far would exceed it."""
     normalize_observations: bool = True
     observation_clip: float | None = setting(10.0, above=0)
     """Bound of normalised observations."""
@@ -74,7 +74,7 @@ class OffPolicyConfig:
     critic_layer_norm: bool = False
     activation: str = setting("relu", choices=tuple(ACTIVATION))
     network_dtype: str = setting("float32", choices=("float32", "bfloat16"))
-    """That the networks compute in. Parameters, losses and optimizers are float32."""
+    """Dtype in which networks compute. Parameters, losses and optimizers are float32."""
     init_at_random_episode_step: bool = True
 
 

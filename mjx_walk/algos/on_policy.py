@@ -29,30 +29,30 @@ class OnPolicyConfig:
     """Settings that all on-policy algorithms have."""
 
     unroll_length: int = setting(10, at_least=1)
-    """Steps of one trajectory piece, over which advantages are estimated."""
+    """Steps of one unroll, over which advantages are estimated."""
     num_unrolls: int = setting(4, at_least=1)
-    """Pieces of every copy in one batch."""
+    """Unrolls of every environment in one batch."""
     normalizer_warmup_steps_per_env: int = setting(16, at_least=0)
-    """Of each copy, at the start: batches of these only tell the scale of observations and rewards. Ten are too few on
-    Humanoid, which falls in 24 under random actions: scaled by the first ten, the positions of the next ten are two
+    """First steps of each environment, whose batches only set the scale of observations and rewards. Ten are too few on
+    Humanoid, which falls after 24 random actions: under the scale of the first ten, the next ten positions are two
     standard deviations away, and learning starts with a KL of 3 to 13."""
     learning_rate: float = setting(3e-4, above=0)
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
-    """`linear`: to zero over `schedule_steps`; `adaptive_kl`: the policy's is adapted after each batch so that it has
-    moved by about `target_kl` at its end, and both are annealed as well."""
+    """`linear`: falls to zero over `schedule_steps`. `adaptive_kl`: also adapts the policy's rate after each batch, so
+    that a batch moves the policy by a KL of about `target_kl`."""
     target_kl: float = setting(0.01, above=0)
     schedule_steps: int = setting(100_000_000, at_least=1)
     """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
     max_policy_grad_norm: float = setting(1.0, above=0)
     max_value_grad_norm: float | None = setting(None, above=0)
-    """Unset, `max_policy_grad_norm` clips policy and value together, as Brax does."""
+    """If unset, `max_policy_grad_norm` clips the joint gradient of policy and value, as in Brax."""
     discount: float = setting(0.97, at_least=0, at_most=1)
     gae_lambda: float = setting(0.95, at_least=0, at_most=1)
     entropy_coef: float = setting(1e-3, at_least=0)
     entropy_schedule: str = setting("constant", choices=("constant", "linear"))
-    """`linear`: to zero over `schedule_steps`."""
+    """`linear`: falls to zero over `schedule_steps`."""
     value_loss_coef: float = setting(0.5, above=0)
-    """Of the squared error; PPO's loss, which is Brax's, halves it once more."""
+    """Coefficient of the squared error. Brax's PPO loss halves it once more."""
     reward_scale: float = setting(0.1, above=0)
     normalize_rewards: bool = False
     """Divide rewards by the running std of the discounted return, before `reward_scale`."""
@@ -63,15 +63,15 @@ class OnPolicyConfig:
     value_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 256, 256), at_least=1)
     activation: str = setting("swish", choices=tuple(ACTIVATION))
     network_dtype: str = setting("float32", choices=("float32", "bfloat16"))
-    """That the networks compute in. Parameters, losses and optimizers are float32."""
+    """Dtype in which networks compute. Parameters, losses and optimizers are float32."""
     distribution: str = setting("tanh_normal", choices=("tanh_normal", "normal"))
-    """Squashed, with a std that depends on the state, or unbounded; the next four are for the latter."""
+    """`tanh_normal`: squashed, with a state-dependent std. `normal`: unbounded, with the next four settings."""
     init_noise_std: float = setting(1.0, above=0)
-    """Of a std that does not depend on the state."""
+    """Initial std, if it does not depend on the state."""
     state_dependent_std: bool = False
     min_log_std: float = setting(-20.0, at_least=-80, at_most=80)
     max_log_std: float = setting(2.0, at_least=-80, at_most=80)
-    """The same as `min_log_std` for a std that does not learn."""
+    """Upper bound. A value equal to `min_log_std` fixes the std."""
     init_at_random_episode_step: bool = True
 
 

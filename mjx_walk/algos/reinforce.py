@@ -88,13 +88,13 @@ class REINFORCE(PolicyGradientAlgorithm):
 
 
 _LARGEST = 5.0
-"""Of features in the fit, in standard deviations, so that a few do not rule it."""
+"""Bound of features in the fit, in standard deviations, so that no few of them dominate it."""
 _RIDGE = 1e-2
 """Small beside the features' variance of 1, and enough for features that say the same in 32-bit floats."""
 
 
 def linear_fit(obs: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
-    """What a least-squares fit on observations and their squares expects the target to be.
+    """Predictions of a least-squares fit of the target to observations and their squares.
 
     Source: the baseline of REINFORCE in Duan et al. 2016, "Benchmarking deep reinforcement learning for continuous
     control". Deviations: no powers of time, since nothing in these tasks depends on it; fitted to the batch itself.
@@ -117,6 +117,6 @@ def linear_fit(obs: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Arra
 
 
 def standardize(features: jax.Array) -> jax.Array:
-    """To mean 0 and std 1 over all but the last axis, and within bounds; what does not vary becomes 0."""
+    """Features with mean 0 and std 1 over all but the last axis, clipped; constant features become 0."""
     mean, std = features.mean(axis=(0, 1)), features.std(axis=(0, 1))
     return jnp.clip((features - mean) / (std + 1e-4), -_LARGEST, _LARGEST)

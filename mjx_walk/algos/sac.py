@@ -19,17 +19,17 @@ from mjx_walk.utils.settings import setting
 
 @dataclasses.dataclass
 class SACConfig(OffPolicyConfig):
-    """Settings of SAC; the recipe of each task changes some of them."""
+    """Settings of SAC."""
 
     name: str = setting("sac", choices=("sac",))
     init_alpha: float = setting(1.0, above=0)
-    """The temperature to begin with."""
+    """Initial temperature."""
     alpha_learning_rate: float = setting(3e-4, above=0)
     target_entropy: float = setting(-0.5, below=0.69)
-    """That the temperature keeps the policy at, in nats per action dimension; Brax's is -0.5. Actions lie in `[-1, 1]`,
-    so that none have more than ln 2, and a temperature that waits for more grows without end."""
+    """Entropy at which the temperature keeps the policy, in nats per action dimension; Brax uses -0.5. Actions lie in
+    `[-1, 1]`, so no policy has more than ln 2, and under a higher target the temperature would grow without bound."""
     final_target_entropy: float | None = setting(None, below=0.69)
-    """What it becomes, linearly over `schedule_steps`."""
+    """Target entropy after `schedule_steps`, approached linearly."""
 
 
 class SACState(flax.struct.PyTreeNode):
@@ -46,7 +46,10 @@ class SACState(flax.struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SAC(OffPolicyAlgorithm):
-    """Source: `sgd_step` of Brax's SAC: temperature, critic and policy take their gradients at the same parameters."""
+    """Soft actor-critic.
+
+    Source: `sgd_step` of Brax's SAC: temperature, critic and policy take their gradients at the same parameters.
+    """
 
     config: SACConfig
     nets: SACNetworks = dataclasses.field(init=False, repr=False)

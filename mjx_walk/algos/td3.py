@@ -9,12 +9,12 @@ from mjx_walk.utils.settings import setting
 
 @dataclasses.dataclass
 class TD3Config(DeterministicConfig):
-    """Settings of TD3; the recipe of each task changes some of them."""
+    """Settings of TD3."""
 
     name: str = setting("td3", choices=("td3",))
     policy_delay: int = setting(2, at_least=1)
     target_noise: float = setting(0.2, at_least=0)
-    """Std of the noise that smooths the target policy, in the networks' `[-1, 1]`."""
+    """Std of the noise that smooths the target policy, in `[-1, 1]`."""
     target_noise_clip: float = setting(0.5, at_least=0)
 
 

@@ -1,4 +1,4 @@
-"""What wraps Brax's networks: the observation normalizer, and actions in Gymnasium's units."""
+"""Brax's networks for one task, and the observation normalizer."""
 
 import dataclasses
 import functools
@@ -18,7 +18,7 @@ from mjx_walk.envs import Task
 from mjx_walk.utils.errors import UserError
 
 MIN_OBSERVATION_STD = 1e-4
-"""Observations that hardly vary (a body's mass) are not blown up beyond this."""
+"""Lower bound of an observation's std, so that near-constant ones such as a body's mass are not amplified."""
 
 
 def make_ppo_networks(task: Task, config: Any) -> ppo_networks.PPONetworks:
@@ -65,7 +65,7 @@ def make_ppo_networks(task: Task, config: Any) -> ppo_networks.PPONetworks:
 
 
 class _BoundedNormal(NormalDistribution):
-    """Brax's, with a std that is kept from vanishing and from running away."""
+    """Brax's normal distribution with a bounded std."""
 
     def __init__(self, event_size: int, config: Any):
         super().__init__(event_size)
@@ -98,7 +98,7 @@ def make_sac_networks(
 def make_deterministic_networks(
     task: Task, config: Any, num_critics: int
 ) -> tuple[brax_networks.FeedForwardNetwork, brax_networks.FeedForwardNetwork]:
-    """A policy whose outputs are to be squashed by tanh, and critics; settings as for `make_sac_networks`."""
+    """A policy whose outputs the caller squashes by tanh, and critics; settings as for `make_sac_networks`."""
     return _policy_network(task.action_size, task, config), _scalar_critics(num_critics, task, config)
 
 
@@ -120,7 +120,7 @@ def _scalar_critics(num_critics: int, task: Task, config: Any) -> brax_networks.
 
 
 def make_critics(num_critics: int, num_outputs: int, task: Task, config: Any) -> brax_networks.FeedForwardNetwork:
-    """Brax's critics, their parameters stacked: one batched product in the place of several small ones.
+    """Brax's critics with stacked parameters: one batched product instead of several small ones.
 
     Inputs are padded with zeros to a multiple of eight, without which a GPU's tensor cores cannot read their rows.
 
@@ -155,7 +155,7 @@ def make_critics(num_critics: int, num_outputs: int, task: Task, config: Any) ->
 
 
 def _compute_in(dtype: str, network: brax_networks.FeedForwardNetwork) -> brax_networks.FeedForwardNetwork:
-    """A network that computes in `dtype`, to which it casts its inputs itself; parameters and results are float32."""
+    """A network that computes in `dtype`; it casts its inputs itself, and parameters and results are float32."""
 
     def cast(tree: Any, dtype: Any) -> Any:
         return jax.tree.map(lambda x: x.astype(dtype), tree)
@@ -167,7 +167,7 @@ def _compute_in(dtype: str, network: brax_networks.FeedForwardNetwork) -> brax_n
 
 
 def init_normalizer(observation_size: int) -> running_statistics.RunningStatisticsState:
-    """Running mean and std of observations, nothing seen yet."""
+    """Running mean and std before the first observation."""
     return running_statistics.init_state(specs.Array((observation_size,), jnp.dtype("float32")))
 
 

@@ -1,4 +1,4 @@
-"""Circular replay buffer on the device: every observation is stored once, every next observation is the true one."""
+"""Circular replay buffer on the device. It stores each observation once, and returns true next observations."""
 
 import dataclasses
 
@@ -16,11 +16,11 @@ _GOES_ON, _TERMINATED, _FIRST_CUT = 0, 1, 2
 
 
 class Replay(flax.struct.PyTreeNode):
-    """T rows of B copies each, in the order of time; row `rows % T` is written next.
+    """T rows of B environments in chronological order; row `rows % T` is written next.
 
-    The observation after a step is the one in the row below, except where an episode was cut off by the time limit.
-    Those last observations lie in slots of their own behind the rows. Two truncations of one copy are at least
-    `max_episode_steps` apart, so a few slots a copy suffice, and a slot is free again when its turn comes.
+    The observation after a step is in the next row, unless a time limit ended the episode. Those last observations have
+    slots of their own after the rows. Two truncations of one environment are at least
+    `max_episode_steps` apart, so a few slots per environment suffice, and a slot is free again when its turn comes.
     """
 
     observation: jax.Array
@@ -38,7 +38,7 @@ class Replay(flax.struct.PyTreeNode):
 
 
 class Steps(flax.struct.PyTreeNode):
-    """Consecutive steps of all copies, `[U, B, …]`."""
+    """Consecutive steps of all environments, `[U, B, …]`."""
 
     observation: jax.Array
     action: jax.Array
@@ -51,7 +51,7 @@ class Steps(flax.struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class ReplayBuffer:
-    """The functions of `Replay`s of one size."""
+    """Functions on a `Replay` of one size."""
 
     task: Task
     num_envs: int
@@ -60,17 +60,17 @@ class ReplayBuffer:
 
     @property
     def num_slots(self) -> int:
-        """Room for the truncated episodes' last observations, of each copy."""
+        """Slots for the last observations of truncated episodes, per environment."""
         return (self.num_rows - 1) // self.task.options.max_episode_steps + 1
 
     @property
     def num_transitions(self) -> int:
-        """Capacity."""
+        """Capacity in transitions."""
         return self.num_rows * self.num_envs
 
     @property
     def num_bytes(self) -> int:
-        """Memory of a buffer, full or empty."""
+        """Bytes of a buffer, full or empty."""
         return num_bytes(self.init)
 
     def init(self) -> Replay:

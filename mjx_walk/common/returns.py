@@ -1,4 +1,4 @@
-"""Discounted sums: pure maths on `[T, B]` arrays."""
+"""Discounted returns on `[T, B]` arrays, and their running scale."""
 
 import flax
 import jax
@@ -13,7 +13,7 @@ def bootstrap_truncated(
 ) -> jax.Array:
     """Fold the value lost at a time limit into the reward of the step that met it.
 
-    After this a truncated step can be handled like a terminated one: the future it was cut off from is already paid.
+    A truncated step can then be handled like a terminated one, because its reward includes the lost value.
 
     Args:
         reward: unscaled.
@@ -47,7 +47,7 @@ def n_step_return(reward: jax.Array, ended: jax.Array, discount: jax.Array | flo
 def returns_to_go(
     reward: jax.Array, terminated: jax.Array, truncated: jax.Array, discount: float
 ) -> tuple[jax.Array, jax.Array]:
-    """Discounted rewards from each step to its episode's end, as far as they were seen.
+    """Observed discounted rewards from each step to the end of its episode.
 
     Args:
         reward: `[T, N]`.
@@ -89,7 +89,7 @@ class ReturnScale(flax.struct.PyTreeNode):
 
 
 def init_return_scale(num_envs: int) -> ReturnScale:
-    """Unit scale, nothing seen yet."""
+    """Unit scale before the first return."""
     return ReturnScale(jnp.zeros(num_envs), jnp.float32(1e-4), jnp.float32(0.0), jnp.float32(1.0), jnp.float32(0.0))
 
 

@@ -1,4 +1,4 @@
-"""Save and restore a whole TrainState with Orbax: atomic, checked leaf by leaf, the newest few kept."""
+"""Save and restore a complete TrainState with Orbax, atomically and with a checksum for each leaf."""
 
 import json
 import os
@@ -24,9 +24,9 @@ FORMAT = 1
 _META = "meta.json"
 _ARRAYS = "arrays"
 _NUMPY = "arrays.npz"
-"""What processes but the first write into the same folders, and what is small."""
+"""File of small pytrees, and of processes other than the main one."""
 _REPLAY = "replay"
-"""The TrainState's field that is kept in the newest checkpoint only, in a part of its own."""
+"""Field of the TrainState that only the newest checkpoint keeps, in a folder of its own."""
 
 _RENAMED_LEAVES = {
     "updates": "iterations",
@@ -39,7 +39,7 @@ _RENAMED_LEAVES = {
 """Leaves by their former paths, which older checkpoints hold."""
 
 HostArrays = dict[str, np.ndarray]
-"""The leaves of a pytree by their paths, copied to the host."""
+"""Leaves of a pytree by their paths, copied to the host."""
 
 
 def to_host(tree: Any) -> HostArrays:
@@ -162,7 +162,7 @@ def restore_newest(
     part: Callable[[Path], Path] = lambda path: path,
     agree: Callable[[bool], bool] = lambda is_complete: is_complete,
 ) -> tuple[Any, dict[str, Any]]:
-    """The newest checkpoint that is whole; a damaged one is passed over with a warning.
+    """The newest complete checkpoint; damaged ones are skipped with a warning.
 
     Args:
         folder: of the checkpoints.
@@ -197,7 +197,7 @@ def prune(folder: Path, keep: int) -> None:
 
 
 class BackgroundSaver:
-    """Writes checkpoints while training goes on, one at a time: training waits only for the copy to the host."""
+    """Writes checkpoints in the background, one at a time; training waits only for the copy to the host."""
 
     def __init__(self, folder: Path, keep: int):
         """
@@ -220,7 +220,7 @@ class BackgroundSaver:
         self._running = self._executor.submit(self._save, copied)
 
     def wait(self) -> None:
-        """Until nothing is being written.
+        """Wait until nothing is being written.
 
         Raises:
             OSError: the disk is full, or what else went wrong in writing.
@@ -263,7 +263,7 @@ def _read(path: Path) -> HostArrays:
 
 
 def _checkpointer() -> ocp.Checkpointer:
-    """Orbax's, which by default would wait for all processes of a team; each writes and reads for itself."""
+    """Orbax's checkpointer for this process alone; by default it would wait for all processes."""
     options = ocp.options.MultiprocessingOptions()
     if jax.process_count() > 1:
         rank = jax.process_index()

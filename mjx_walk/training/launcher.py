@@ -14,11 +14,11 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.signals import Interrupt, exit_code
 
 _PATIENCE = 20.0
-"""Seconds that the others are given to end once one process has ended badly."""
+"""Seconds that the other processes have to exit after one has failed."""
 
 
 def count(asked: int | str) -> int:
-    """How many processes `devices=N` or `devices=all` is.
+    """Number of processes that `devices=N` or `devices=all` asks for.
 
     Raises:
         UserError: this host has fewer GPUs.
@@ -34,7 +34,7 @@ def count(asked: int | str) -> int:
 
 
 def run(arguments: list[str], size: int) -> int:
-    """Train in `size` processes. The first one's output is shown; Ctrl-C and SIGTERM reach all.
+    """Train in `size` processes. The output of the main process is shown; Ctrl-C and SIGTERM reach all.
 
     Returns:
         The exit code: that of a signal, 2 for a user's mistake, 1 where a process has died.
@@ -92,7 +92,7 @@ def _log(logs: Path, rank: int) -> Path:
 
 
 def _end(processes: list[subprocess.Popen]) -> None:
-    """Wait a little for the others of a process that has ended badly, which wait for it in vain; then end them."""
+    """Wait `_PATIENCE` seconds for the remaining processes, then kill them: they wait for the failed one."""
     deadline = time.monotonic() + _PATIENCE
     while time.monotonic() < deadline and any(process.poll() is None for process in processes):
         time.sleep(0.2)

@@ -1,4 +1,4 @@
-"""Whether a run fits the memory and the disk, said before anything is allocated."""
+"""Check that a run fits memory and disk, before anything is allocated."""
 
 import shutil
 from pathlib import Path
@@ -10,11 +10,11 @@ from mjx_walk.utils.devices import device_memory, num_bytes
 from mjx_walk.utils.errors import UserError
 
 _USABLE = 0.9
-"""Share of the device's memory that a replay may take."""
+"""Fraction of the device's memory that a replay may use."""
 
 
 def check_replay(algorithm: Algorithm, run_dir: Path, num_runs: int = 1) -> str | None:
-    """Say what a replay takes of memory and disk.
+    """Memory and disk that a replay needs, as a line to print.
 
     Args:
         algorithm: what is to run.
