@@ -79,7 +79,7 @@ def test_policy_gradient_resume_is_exact(tmp_path, algo):
     train_here(tmp_path / "halves", *settings, f"total_steps={2 * TINY_CHUNK}", tiny=tiny)
     train(tmp_path / "halves", f"total_steps={4 * TINY_CHUNK}", "resume=true", tiny=[])
     whole, halves = leaves(tmp_path / "whole", 4), leaves(tmp_path / "halves", 4)
-    assert whole.keys() == halves.keys() and len(whole) > 40 and ("noise" in whole) is (algo == "a2c")
+    assert whole.keys() == halves.keys() and len(whole) > 40 and ("exploration" in whole) == (algo == "a2c")
     for name, leaf in whole.items():
         np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
 
