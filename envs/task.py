@@ -182,7 +182,7 @@ class Task(TrainableTask, abc.ABC):
         return {name: value for name, value in self.options.changed().items() if name not in _NOT_IN_GYMNASIUM}
 
     @property
-    def has_own_reward(self) -> bool:
+    def has_custom_reward(self) -> bool:
         """Whether the reward differs from Gymnasium's."""
         return self._reward_function is not None or any(vars(self.options.shaping).values())
 

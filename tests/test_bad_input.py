@@ -213,7 +213,7 @@ def test_a_policy_of_another_environment_is_refused(finished, tmp_path):
     config = yaml.safe_load((copy / "config.yaml").read_text())
     config["env"]["exclude_current_positions_from_observation"] = False
     (copy / "config.yaml").write_text(yaml.safe_dump(config))
-    with pytest.raises(UserError, match=r"is of another run, or of another version: .* should be \(18"):
+    with pytest.raises(UserError, match=r"belongs to another run or version: .* should be \(18"):
         api.load_run(copy)
     (copy / "config.yaml").write_text("not: ours\n")
     with pytest.raises(UserError, match="not a configuration of this version"):

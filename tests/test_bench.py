@@ -45,7 +45,7 @@ def test_a_mistake_in_the_settings_costs_one_line(capsys):
 def test_devices_are_doubled_up_to_those_asked_for(capsys):
     assert [device_counts(asked) for asked in (None, 1, 4, 6)] == [[], [1], [1, 2, 4], [1, 2, 4, 6]]
     assert command_here("bench", "env=walker2d", "devices=0") == 2
-    assert capsys.readouterr().err.startswith("error: devices=0: write devices=all, or a number")
+    assert capsys.readouterr().err.startswith("error: devices=0 is not valid; use devices=all or an integer")
 
 
 def test_a_speed_is_that_after_everything_is_compiled(monkeypatch):

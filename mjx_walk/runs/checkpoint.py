@@ -19,14 +19,14 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.versions import __version__
 
 FORMAT = 1
-"""Raised when older checkpoints can no longer be read."""
+"""Version of the checkpoint format. Increment it when a change makes older checkpoints unreadable."""
 
 _META = "meta.json"
 _ARRAYS = "arrays"
 _NUMPY = "arrays.npz"
-"""File of small pytrees, and of processes other than the main one."""
+"""File that replaces Orbax's folder for small pytrees and in processes other than the main one."""
 _REPLAY = "replay"
-"""Field of the TrainState that only the newest checkpoint keeps, in a folder of its own."""
+"""Field of the TrainState that only the newest checkpoint keeps, and the name of its folder."""
 
 _RENAMED_LEAVES = {
     "updates": "iterations",
@@ -36,25 +36,25 @@ _RENAMED_LEAVES = {
     "env.live": "evaluation",
     "noise": "exploration",
 }
-"""Leaves by their former paths, which older checkpoints hold."""
+"""Present paths of leaves, by the former paths in older checkpoints."""
 
 HostArrays = dict[str, np.ndarray]
-"""Leaves of a pytree by their paths, copied to the host."""
+"""Host copies of a pytree's leaves, by path."""
 
 
 def to_host(tree: Any) -> HostArrays:
-    """Copy a pytree, so that its own memory may be donated to the next program."""
+    """Copy a pytree to the host. The next program may then reuse its device memory."""
     return {name: np.array(leaf) for name, leaf in _named_leaves(jax.device_get(tree)).items()}
 
 
 def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False) -> None:
-    """Write a pytree of arrays. The folder appears under its name only when it is complete.
+    """Write a pytree of arrays. The folder gets its name only when it is complete.
 
     Args:
-        path: folder to make; one that is there is replaced.
-        tree: arrays of any dtype, or what `to_host` made of them.
-        meta: JSON-able facts to keep beside it; version and checksums are added.
-        as_numpy: whether in one file of NumPy's, compressed, instead of Orbax's folder.
+        path: folder to write; an existing one is replaced.
+        tree: arrays of any dtype, or the result of `to_host`.
+        meta: JSON-serializable facts to store with the arrays; version and checksums are added.
+        as_numpy: write one compressed NumPy file instead of Orbax's folder.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
     meta = meta | {
@@ -73,31 +73,31 @@ def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False) ->
     former = path.with_name(f".{path.name}.former")
     shutil.rmtree(former, ignore_errors=True)
     if path.exists():
-        os.replace(path, former)  # at once, which removing a folder is not
+        os.replace(path, former)  # atomic, unlike removing a folder
     os.replace(unfinished, path)
     shutil.rmtree(former, ignore_errors=True)
 
 
 def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
-    """Read what `save` wrote.
+    """Read a checkpoint that `save` wrote.
 
     Args:
-        path: its folder.
-        like: a pytree of arrays or `ShapeDtypeStruct`s of the same structure.
+        path: folder of the checkpoint.
+        like: pytree of arrays or `ShapeDtypeStruct`s with the same structure.
 
     Returns:
-        The tree, on the default device, and the facts beside it. Where `prune` has taken the replay away, it is
-        empty, with a warning.
+        The tree, on the default device, and its facts. If `prune` has removed the replay buffer, the tree has an empty
+        one, and a warning says so.
 
     Raises:
-        UserError: made by an incompatible version, or for a TrainState of another shape.
+        UserError: an incompatible version wrote the checkpoint, or its leaves have other shapes.
         ValueError: the folder is damaged.
     """
     meta = read_meta(path)
     if meta.get("format") != FORMAT:
         raise UserError(
-            f"{path} was written by mjx_walk {meta.get('mjx_walk')} in checkpoint format {meta.get('format')}; "
-            f"this is {__version__} with format {FORMAT}"
+            f"{path} has checkpoint format {meta.get('format')}, written by mjx_walk {meta.get('mjx_walk')}; "
+            f"mjx_walk {__version__} reads format {FORMAT}; install the version that wrote it, or train again"
         )
     wanted = _named_leaves(like)
     meta["crc32"] = {present_name(name): crc for name, crc in meta["crc32"].items()}
@@ -106,11 +106,11 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
         if (path / _REPLAY).exists():
             arrays |= _read(path / _REPLAY)
         else:
-            warnings.warn(f"{path} has no replay any more; it is filled again before learning goes on", stacklevel=2)
+            warnings.warn(f"{path} has no replay buffer; training refills it before learning continues", stacklevel=2)
             arrays |= {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in wanted.items() if _is_replay(name)}
             meta["crc32"] = {name: crc for name, crc in meta["crc32"].items() if not _is_replay(name)}
     for name, leaf in wanted.items():
-        if name in arrays and arrays[name].dtype.kind == "V":  # NumPy's files know no bfloat16
+        if name in arrays and arrays[name].dtype.kind == "V":  # NumPy's files do not support bfloat16
             arrays[name] = arrays[name].view(leaf.dtype)
     for name, crc in meta["crc32"].items():
         if name not in arrays or _crc32(arrays[name]) != crc:
@@ -119,15 +119,14 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
         if name not in arrays or arrays[name].shape != leaf.shape or arrays[name].dtype != leaf.dtype:
             found = f"{arrays[name].shape} {arrays[name].dtype}" if name in arrays else "nothing"
             raise UserError(
-                f"{path} is of another run, or of another version: "
-                f"{name} should be {leaf.shape} {leaf.dtype}, found {found}"
+                f"{path} belongs to another run or version: {name} should be {leaf.shape} {leaf.dtype}, found {found}"
             )
     leaves = [jnp.asarray(arrays[name]) for name in wanted]
     return jax.tree.unflatten(jax.tree.structure(like), leaves), meta
 
 
 def present_name(leaf: str) -> str:
-    """The present path of a leaf."""
+    """Present path of a leaf, which may have a former path."""
     for old, new in _RENAMED_LEAVES.items():
         if leaf == old or leaf.startswith(f"{old}."):
             return new + leaf[len(old) :]
@@ -135,7 +134,7 @@ def present_name(leaf: str) -> str:
 
 
 def read_meta(path: Path) -> dict[str, Any]:
-    """The facts beside a checkpoint.
+    """Facts stored with a checkpoint.
 
     Raises:
         ValueError: the folder is damaged.
@@ -152,7 +151,7 @@ def list_steps(folder: Path) -> list[Path]:
 
 
 def step_path(folder: Path, env_steps: int) -> Path:
-    """Where the checkpoint of a number of environment steps lies."""
+    """Path of the checkpoint at a number of environment steps."""
     return folder / f"{env_steps:013d}"
 
 
@@ -162,16 +161,16 @@ def restore_newest(
     part: Callable[[Path], Path] = lambda path: path,
     agree: Callable[[bool], bool] = lambda is_complete: is_complete,
 ) -> tuple[Any, dict[str, Any]]:
-    """The newest complete checkpoint; damaged ones are skipped with a warning.
+    """Restore the newest complete checkpoint. Skips damaged ones with a warning.
 
     Args:
-        folder: of the checkpoints.
+        folder: folder of the checkpoints.
         like: as for `restore`.
-        part: what to read of the checkpoint at a path; ValueError where that cannot be told.
-        agree: whether to take it, asked once for each that is tried, with whether that part is whole.
+        part: maps a checkpoint's path to the path to read. Raises ValueError if the checkpoint is damaged.
+        agree: maps whether the part is complete to whether to use the checkpoint. Called once per checkpoint.
 
     Raises:
-        UserError: there is none, or it belongs to another run.
+        UserError: there is no usable checkpoint, or it belongs to another run.
     """
     for path in reversed(list_steps(folder)):
         found = None
@@ -180,14 +179,19 @@ def restore_newest(
         except UserError:
             raise
         except ValueError as error:
-            warnings.warn(f"{error}; falling back to the checkpoint before it", stacklevel=2)
+            warnings.warn(f"{error}; falling back to the previous checkpoint", stacklevel=2)
         if agree(found is not None) and found:
             return found
-    raise UserError(f"no usable checkpoint in {folder}; nothing to resume")
+    raise UserError(f"no usable checkpoint in {folder}; start a new run without resume=true")
 
 
 def prune(folder: Path, keep: int) -> None:
-    """Remove all but the newest `keep` checkpoints, the replay of all but the newest, and interrupted saves."""
+    """Remove old checkpoints, old replay buffers and unfinished saves.
+
+    Args:
+        folder: folder of the checkpoints.
+        keep: number of newest checkpoints to keep. Only the newest keeps its replay buffer.
+    """
     for path in list_steps(folder)[:-keep]:
         shutil.rmtree(path)
     for path in list_steps(folder)[:-1]:
@@ -197,13 +201,13 @@ def prune(folder: Path, keep: int) -> None:
 
 
 class BackgroundSaver:
-    """Writes checkpoints in the background, one at a time; training waits only for the copy to the host."""
+    """Writes checkpoints in the background, one at a time. Training waits only for the copy to the host."""
 
     def __init__(self, folder: Path, keep: int):
         """
         Args:
-            folder: of the checkpoints.
-            keep: newest ones kept.
+            folder: folder of the checkpoints.
+            keep: number of newest checkpoints to keep.
         """
         self._folder = folder
         self._keep = keep
@@ -211,19 +215,20 @@ class BackgroundSaver:
         self._running: Future[None] | None = None
 
     def save(self, *parts: tuple[Path, Any, dict[str, Any]]) -> None:
-        """Copy pytrees to the host and begin to write them, in turn; each as the arguments of `checkpoint.save`.
+        """Copy pytrees to the host and start to write them in order. Waits for the previous save first.
 
-        Waits for those before.
+        Args:
+            parts: arguments of `checkpoint.save` for each pytree.
         """
         self.wait()
         copied = [(path, to_host(tree), meta) for path, tree, meta in parts]
         self._running = self._executor.submit(self._save, copied)
 
     def wait(self) -> None:
-        """Wait until nothing is being written.
+        """Wait until the current save is complete.
 
         Raises:
-            OSError: the disk is full, or what else went wrong in writing.
+            OSError: writing failed, for example because the disk is full.
         """
         if self._running:
             self._running.result()
@@ -240,7 +245,7 @@ def _is_replay(name: str) -> bool:
 
 
 def _write(path: Path, arrays: HostArrays, as_numpy: bool) -> None:
-    if as_numpy or jax.process_index():  # Orbax writes arrays of the host from the first process alone
+    if as_numpy or jax.process_index():  # Orbax writes host arrays only from the main process
         path.mkdir()
         write = np.savez_compressed if as_numpy else np.savez
         write(path / _NUMPY, allow_pickle=False, **arrays)
@@ -257,13 +262,13 @@ def _read(path: Path) -> HostArrays:
         else:
             with _checkpointer() as checkpointer:
                 found = checkpointer.restore(path.absolute())
-    except Exception as error:  # Orbax reports damage through many types
+    except Exception as error:  # Orbax reports damage with many exception types
         raise ValueError(f"{path} is damaged: {str(error).splitlines()[0][:200]}") from error
     return {present_name(name): array for name, array in found.items()}
 
 
 def _checkpointer() -> ocp.Checkpointer:
-    """Orbax's checkpointer for this process alone; by default it would wait for all processes."""
+    """Orbax's checkpointer for this process alone. By default, Orbax waits for all processes."""
     options = ocp.options.MultiprocessingOptions()
     if jax.process_count() > 1:
         rank = jax.process_index()

@@ -89,7 +89,7 @@ def prepare(configs: list[Config]) -> tuple[list[RunFolder], list[Config]]:
             raise UserError(f"{folder.path} and {folders[0].path} differ in {'; '.join(differing)}; resume each alone")
     steps = {_newest(folder) for folder in folders}
     if len(steps) > 1:
-        raise UserError(f"the seeds stand at different steps ({', '.join(sorted(steps))}); resume each alone")
+        raise UserError(f"the seeds are at different steps ({', '.join(sorted(steps))}); resume each alone")
     for folder, config in zip(folders, configs, strict=True):
         try:
             folder.checkpoints.mkdir(parents=True, exist_ok=config.resume)

@@ -1,8 +1,8 @@
-"""One run on several devices, one process each: every process collects on its device, and all learn together.
+"""One run on several devices with one process each. Each process collects on its device, and all learn together.
 
-A program over several devices crashes where it contains Warp's physics (jax 0.11, Warp 1.18). So `collect` is a local
-program of each process, and `learn`, which contains no physics, is one program over all devices. It averages gradients
-and running statistics over the devices, so that what is learned is the same on each.
+A program over several devices crashes if it contains Warp's physics (jax 0.11, Warp 1.18). `collect` is therefore a
+local program of each process. `learn` contains no physics and is one program over all devices. It averages gradients
+and running statistics, so that the learned parameters are equal on all devices.
 """
 
 import dataclasses
@@ -27,13 +27,13 @@ from mjx_walk.utils.types import Metric, Metrics, Reduction, map_marked
 
 _PATH_BYTES = 4096
 _TIMEOUT = 3600
-"""Seconds that processes wait for each other, of which one may read or write a large replay."""
+"""Seconds that processes wait for each other. One of them may read or write a large replay buffer."""
 _barriers = itertools.count()
 
 
 @dataclasses.dataclass(frozen=True)
 class Processes:
-    """The processes of a run, with one device each."""
+    """Processes of a run, with one device each."""
 
     process_index: int = 0
     process_count: int = 1
@@ -44,20 +44,20 @@ class Processes:
         return self.process_index == 0
 
     def wait_for_all(self) -> None:
-        """Wait until all processes are here. On CPUs, a program over all devices waits for half a minute only."""
+        """Wait until all processes reach this call. On CPUs, a program over all devices waits only half a minute."""
         if self.process_count > 1:
             name, processes = f"mjx_walk_{next(_barriers)}", set(range(self.process_count))
             multihost.sync_global_processes(name, timeout=_TIMEOUT, processes=processes)
 
     def all_gather(self, number: int) -> list[int]:
-        """The numbers of all processes, by process index."""
+        """Numbers of all processes, by process index."""
         if self.process_count == 1:
             return [number]
         self.wait_for_all()
         return [int(x) for x in multihost_utils.process_allgather(np.int64(number))]
 
     def broadcast_one_to_all(self, text: str) -> str:
-        """The text of the main process."""
+        """Text of the main process."""
         if self.process_count == 1:
             return text
         self.wait_for_all()
@@ -68,8 +68,8 @@ class Processes:
 
 
 def join_processes() -> Processes:
-    """The processes that `launcher` or a cluster's scheduler has started with this one."""
-    jax.config.update("jax_enable_preemption_service", False)  # it would take our SIGTERM
+    """Join the processes that `launcher` or a cluster's scheduler has started."""
+    jax.config.update("jax_enable_preemption_service", False)  # its handler would replace ours for SIGTERM
     given = os.environ.get("MJX_WALK_PROCESS")
     if given:
         index, count, coordinator = given.split(",")
@@ -80,7 +80,7 @@ def join_processes() -> Processes:
 
 
 def per_device(config: Any, process_count: int) -> Any:
-    """The settings of an algorithm on one of several devices, which counts its own steps only."""
+    """Settings of an algorithm for one of several devices, which counts only its own steps."""
     if process_count == 1:
         return config
     names = {field.name for field in dataclasses.fields(config)} & {"schedule_steps", "learning_starts"}
@@ -88,12 +88,12 @@ def per_device(config: Any, process_count: int) -> Any:
 
 
 def make_devices_program(algorithm: Algorithm, processes: Processes, iterations_per_call: int) -> Program:
-    """One run on the devices of all processes. States have an axis of length one in front.
+    """Program of one run on the devices of all processes. States have a leading axis of length one.
 
     Args:
-        algorithm: with the axis name `DEVICES`.
-        processes: of the run.
-        iterations_per_call: iterations of a call.
+        algorithm: algorithm with the axis name `DEVICES`.
+        processes: processes of the run.
+        iterations_per_call: number of iterations in a call.
     """
     init = make_init(functools.partial(_init_on_device, algorithm, processes.process_index))
     return make_axis_program(
@@ -107,17 +107,17 @@ def make_devices_program(algorithm: Algorithm, processes: Processes, iterations_
 
 
 def _init_on_device(algorithm: Algorithm, process_index: int, key: jax.Array) -> TrainState:
-    """The state of a device. Leaves that each device has its own of start from a key of its own."""
+    """Initial state of a device. Leaves that are per device start from the device's own key."""
     shared, own = algorithm.init(key), algorithm.init(jax.random.fold_in(key, process_index))
     return _expand(map_marked(lambda _, leaf: leaf, "per_device", shared, own))
 
 
 def _make_step(algorithm: Algorithm, processes: Processes, iterations_per_call: int) -> Step:
-    """As `programs.make_step`; the metrics are those of all devices."""
+    """Like `programs.make_step`, with metrics over all devices."""
     devices = sorted(jax.devices(), key=lambda device: device.process_index)
     sharding = NamedSharding(Mesh(np.array(devices), (DEVICES,)), PartitionSpec(DEVICES))
 
-    @functools.partial(jax.jit, inline=True)  # traced once, for the sizes and for the program
+    @functools.partial(jax.jit, inline=True)  # traced once for both the sizes and the program
     def collect(state):
         return _expand(algorithm.collect(_squeeze(state)))
 
@@ -126,7 +126,7 @@ def _make_step(algorithm: Algorithm, processes: Processes, iterations_per_call: 
         return _expand((state, {name: _over_devices(metric) for name, metric in metrics.items()}))
 
     def share(x: jax.Array) -> jax.Array:
-        """This process's part of an array over all devices; nothing is copied."""
+        """Array over all devices with this process's part in place. Copies nothing."""
         shape = (processes.process_count, *x.shape[1:])
         return jax.make_array_from_single_device_arrays(shape, sharding, [x])
 
@@ -162,8 +162,7 @@ def _make_step(algorithm: Algorithm, processes: Processes, iterations_per_call: 
 def in_place(collect: Callable[[Any], tuple[Any, Any]]) -> Callable[[Any, Any], tuple[Any, Any]]:
     """Compile `state → (state, batch)` as `(state, former batch) → (state, batch)`, in the memory of its arguments.
 
-    In new memory, XLA may place arrays that physics reads, and Warp records its kernels again for every array that has
-    moved.
+    With new memory, XLA may move arrays that physics reads. Warp records its kernels again when an array moves.
     """
     return jax.jit(lambda state, former_batch: collect(state), donate_argnums=(0, 1), keep_unused=True)
 

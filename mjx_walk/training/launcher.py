@@ -1,4 +1,4 @@
-"""`devices=N`: one process for each GPU of this host, which train one run together."""
+"""`devices=N`: start one process for each GPU of this host. They train one run together."""
 
 import os
 import signal
@@ -18,28 +18,28 @@ _PATIENCE = 20.0
 
 
 def count(asked: int | str) -> int:
-    """Number of processes that `devices=N` or `devices=all` asks for.
+    """Number of processes for `devices=N` or `devices=all`.
 
     Raises:
-        UserError: this host has fewer GPUs.
+        UserError: the value is not valid, or this host has fewer GPUs.
     """
     hardware, available = count_devices()
     if asked == "all":
         return available
     if not isinstance(asked, int) or asked < 1:
-        raise UserError(f"devices={asked}: write devices=all, or a number from 1 up")
+        raise UserError(f"devices={asked} is not valid; use devices=all or an integer of at least 1")
     if hardware == "gpu" and asked > available:
-        raise UserError(f"devices={asked}: this host has {available}")
+        raise UserError(f"devices={asked} is more than the GPUs of this host ({available}); use devices=all")
     return asked
 
 
 def run(arguments: list[str], size: int) -> int:
-    """Train in `size` processes. The output of the main process is shown; Ctrl-C and SIGTERM reach all.
+    """Train in `size` processes. Shows the output of the main process. Forwards Ctrl-C and SIGTERM to all.
 
     Returns:
-        The exit code: that of a signal, 2 for a user's mistake, 1 where a process has died.
+        The exit code: the signal's after a signal, 2 after invalid input, 1 if a process failed.
     """
-    with tempfile.TemporaryDirectory() as logs, Interrupt("all devices finish their chunk, then save") as interrupt:
+    with tempfile.TemporaryDirectory() as logs, Interrupt("all devices finish this call, then save") as interrupt:
         processes = _start(arguments, size, Path(logs))
         has_told = False
         bad: list[int] = []
@@ -53,15 +53,17 @@ def run(arguments: list[str], size: int) -> int:
         _end(processes)
         if not bad:
             return 0
-        rank = min(bad, key=lambda rank: (processes[rank].returncode > 0, rank))  # one that was killed, if any
+        rank = min(bad, key=lambda rank: (processes[rank].returncode > 0, rank))  # killed ones first
         code = processes[rank].returncode
         if interrupt.signal_name:
             return exit_code(interrupt.signal_name)
         if rank:
             print(_log(Path(logs), rank).read_text(errors="replace")[-2000:], file=sys.stderr)
-        if code != 2:  # which says itself what is wrong
+        if code != 2:  # with code 2 the process has printed its own error
             print(
-                f"error: the process of device {rank} died; what was saved is whole, add resume=true", file=sys.stderr
+                f"error: the process of device {rank} failed with exit code {code}; "
+                "the last saved checkpoint is complete; add resume=true to resume from it",
+                file=sys.stderr,
             )
         return 2 if code == 2 else 1
 
@@ -92,7 +94,7 @@ def _log(logs: Path, rank: int) -> Path:
 
 
 def _end(processes: list[subprocess.Popen]) -> None:
-    """Wait `_PATIENCE` seconds for the remaining processes, then kill them: they wait for the failed one."""
+    """Wait `_PATIENCE` seconds for the remaining processes, then kill them. They may block on the failed process."""
     deadline = time.monotonic() + _PATIENCE
     while time.monotonic() < deadline and any(process.poll() is None for process in processes):
         time.sleep(0.2)

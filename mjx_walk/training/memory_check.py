@@ -1,4 +1,4 @@
-"""Check that a run fits memory and disk, before anything is allocated."""
+"""Check that a run fits into memory and on disk before it allocates anything."""
 
 import shutil
 from pathlib import Path
@@ -10,22 +10,22 @@ from mjx_walk.utils.devices import device_memory, num_bytes
 from mjx_walk.utils.errors import UserError
 
 _USABLE = 0.9
-"""Fraction of the device's memory that a replay may use."""
+"""Maximum fraction of the device's memory for the replay buffer."""
 
 
 def check_replay(algorithm: Algorithm, run_dir: Path, num_runs: int = 1) -> str | None:
-    """Memory and disk that a replay needs, as a line to print.
+    """Memory and disk space that the replay buffer needs, as a line to print.
 
     Args:
-        algorithm: what is to run.
-        run_dir: where it is to be saved; it need not exist.
-        num_runs: how many are to run side by side.
+        algorithm: the algorithm, with its replay size.
+        run_dir: run folder; it need not exist.
+        num_runs: number of seeds in one process.
 
     Returns:
-        One line, or None where there is no replay.
+        One line, or None if the algorithm has no replay buffer.
 
     Raises:
-        UserError: it does not fit.
+        UserError: the replay buffer or its checkpoints do not fit.
     """
     if not algorithm.replay_bytes:
         return None
@@ -34,15 +34,16 @@ def check_replay(algorithm: Algorithm, run_dir: Path, num_runs: int = 1) -> str 
     replay, disk = f"{replay_bytes / 1e9:,.2f} GB", f"{2 * checkpoint_bytes / 1e9:,.2f} GB"
     memory = device_memory()
     if replay_bytes > _USABLE * memory:
-        fewer = " or train fewer seeds side by side (compare: together=1)" if num_runs > 1 else ""
+        fewer = " or train fewer seeds in one process (compare: together=1)" if num_runs > 1 else ""
         raise UserError(
-            f"the replay needs {replay}, but the device has {memory / 1e9:,.2f} GB; lower algo.replay_capacity{fewer}"
+            f"the replay buffer needs {replay}, but the device has {memory / 1e9:,.2f} GB; "
+            f"lower algo.replay_capacity{fewer}"
         )
     existing = next(path for path in (run_dir.absolute(), *run_dir.absolute().parents) if path.exists())
     free = shutil.disk_usage(existing).free
     if 2 * checkpoint_bytes > free:
         raise UserError(
-            f"checkpoints with their replay need {disk} of disk, but {existing} has {free / 1e9:,.2f} GB left; lower "
-            "algo.replay_capacity or choose another run_dir"
+            f"checkpoints with the replay buffer need {disk} of disk space, but {existing} has "
+            f"{free / 1e9:,.2f} GB free; lower algo.replay_capacity or choose another run_dir"
         )
-    return f"Replay: {replay} of device memory, and while a checkpoint replaces the one before up to {disk} of disk."
+    return f"Replay buffer: {replay} of device memory, and up to {disk} of disk space while a checkpoint is replaced."

@@ -1,4 +1,4 @@
-"""What a run leaves in its folder while it trains: rows, checkpoints, policies and scores."""
+"""Write the metrics, checkpoints, policies and scores of a run to its folder."""
 
 import logging
 import math
@@ -21,16 +21,16 @@ _log = logging.getLogger(__name__)
 
 
 class Recorder:
-    """The run folder of one run. Processes other than the main one save only their part of the checkpoints."""
+    """Writes one run's folder. Processes other than the main one save only their part of the checkpoints."""
 
     def __init__(self, config: Config, task: Task, algorithm: Algorithm, folder: RunFolder, processes: Processes):
         """
         Args:
             config: checked configuration.
             task: the unbatched environment.
-            algorithm: of this run alone, on one device.
+            algorithm: algorithm of this run, on one device.
             folder: prepared run folder.
-            processes: that train the run.
+            processes: processes that train the run.
         """
         self.config = config
         self._task = task
@@ -50,10 +50,10 @@ class Recorder:
         return self._processes.is_main_process
 
     def restore(self, like: TrainState) -> tuple[TrainState, dict[str, Any]]:
-        """The newest saved TrainState, and its `env_steps` and `wall_seconds`.
+        """Restore the newest saved TrainState, and its `env_steps` and `wall_seconds`.
 
         Args:
-            like: shapes of a TrainState.
+            like: TrainState of shapes and dtypes.
         """
         state, facts = restore_newest(self._folder.checkpoints, like, self._processes)
         if self._best_policy(state):
@@ -61,11 +61,11 @@ class Recorder:
         return state, facts
 
     def begin(self, env_steps: int, will_train: bool) -> None:
-        """Open the logs, and save the configuration of a resumed run.
+        """Open the logs. Save the configuration of a resumed run.
 
         Args:
-            env_steps: where the run resumes; rows after it are dropped.
-            will_train: whether iterations follow, which make an old score outdated.
+            env_steps: environment steps at which the run resumes; later rows are dropped.
+            will_train: whether iterations follow; they invalidate an old score, which is then removed.
         """
         if not self._is_main_process:
             return
@@ -89,9 +89,10 @@ class Recorder:
             self._filmer.take(policy_params, env_steps)
 
     def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:
-        """Start to save the best policy, if it is new, and then the whole state, whose replay may take long.
+        """Start to save the complete state, and first the best policy if it is new.
 
-        Before the first evaluation has ended, the best policy is the present one.
+        Until the first evaluation ends, the current policy counts as the best. A state with a replay buffer may take
+        long to save.
         """
         facts = {"env_steps": env_steps, "wall_seconds": wall_seconds, NUM_DEVICES: self._processes.process_count}
         parts: list[Any] = [(checkpoint.step_path(self._checkpoints, env_steps), state, facts)]
@@ -107,18 +108,18 @@ class Recorder:
         self._saver.save(*parts)
 
     def end(self, state: TrainState, env_steps: int) -> None:
-        """Close the logs, draw them, and keep the policies that may be scored."""
+        """Close the logs, draw the curves, and keep the policies that may be scored."""
         if not self._writer:
             return
         self._writer.close()
         if self._wandb:
             self._wandb.close()
-        from mjx_walk.viewing.curves import plot_run  # Matplotlib, which training need not wait for at its start
+        from mjx_walk.viewing.curves import plot_run  # imports Matplotlib, which slows the start
 
         try:
             plot_run(self._folder)
         except OSError as error:
-            _log.warning(f"{self._folder.path} could not be drawn: {error}")
+            _log.warning(f"cannot draw the curves of {self._folder.path}: {error}; draw them with mjx_walk.plots")
         self._policies = [(self._algorithm.policy_params(state), {"env_steps": env_steps})]
         best = self._best_policy(state)
         if best:
@@ -127,14 +128,14 @@ class Recorder:
     def score(self, wall_seconds: float) -> Scores | None:
         """Score the last policy in the real Gymnasium, and write `eval_gymnasium.json`.
 
-        If an earlier policy did better in the inline evaluations, it is scored too, and the better score is kept.
-        Under a reward of the user's own, only that earlier policy is scored: Gymnasium's reward cannot choose there.
+        An earlier policy with a higher inline evaluation is scored too, and the better score is kept. With a custom
+        reward only that earlier policy is scored, because Gymnasium's reward is not the training objective.
         """
         num_episodes = self.config.evaluation.gymnasium_episodes
         if not num_episodes or not self._policies:
             return None
         scored: list[tuple[Scores, Any, dict[str, Any]]] = []
-        candidates = self._policies[-1:] if self._task.has_own_reward else self._policies
+        candidates = self._policies[-1:] if self._task.has_custom_reward else self._policies
         for params, facts in candidates:
             if not scored or facts["eval_return"] > scored[0][0].mean:
                 scored.append((self._score_in_gymnasium(params, num_episodes), params, facts))
@@ -144,7 +145,7 @@ class Recorder:
         return scores
 
     def wait(self) -> None:
-        """Wait until everything is on the disk."""
+        """Wait until all files are on disk."""
         self._saver.wait()
         if self._filmer:
             self._filmer.wait()
@@ -153,7 +154,7 @@ class Recorder:
         return score_in_gymnasium(self._task, deterministic_act(self._algorithm, policy_params), num_episodes)
 
     def _best_policy(self, state: TrainState) -> tuple[Any, dict[str, Any]] | None:
-        """The policy with the highest inline evaluation, and its facts; None before the first has ended."""
+        """Policy with the highest inline evaluation, and its facts. None until the first evaluation ends."""
         evaluation = state.evaluation
         if math.isinf(evaluation.best_return):
             return None

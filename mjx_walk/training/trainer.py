@@ -33,7 +33,7 @@ _SPEED_WINDOW = 10.0
 
 
 class Trainer:
-    """From configurations to scores, for one run or for several that differ only in their seed."""
+    """Trains and scores one run, or several runs that differ only in their seed."""
 
     def __init__(
         self,
@@ -45,11 +45,11 @@ class Trainer:
     ):
         """
         Args:
-            configs: checked configurations, alike but for `seed` and `run_dir`.
+            configs: checked configurations that differ only in `seed` and `run_dir`.
             task: the unbatched environment.
-            folders: prepared run folders, one for each.
-            on_metrics: called with every row that is logged.
-            processes: that train one run together, each with `num_envs` environments.
+            folders: prepared run folders, one for each configuration.
+            on_metrics: called with every logged row.
+            processes: processes that train one run together, with `num_envs` environments each.
         """
         self.config = config = configs[0]
         self._task = task
@@ -88,13 +88,13 @@ class Trainer:
         return make_single_program(algorithm, iterations, fused)
 
     def train(self) -> str | None:
-        """Train to the end, or until a signal asks to stop.
+        """Train to the end, or until a stop signal.
 
         Returns:
-            None at the end, else the name of the signal; the states are saved either way.
+            None at the end, otherwise the name of the signal. The states are saved in both cases.
 
         Raises:
-            UserError: a policy is not finite.
+            UserError: training has diverged, so that a policy is not finite.
         """
         state, call = self._start()
         progress = Progress(self.num_calls * self.steps_per_call, call * self.steps_per_call)
@@ -107,7 +107,7 @@ class Trainer:
             while call < self.num_calls and not self._stop_signal(interrupt) and not diverged:
                 state, metrics = self._program.step(state)
                 call += 1
-                rows = self._rows(call, metrics)  # waits for the call, so that the row has the time of its end
+                rows = self._rows(call, metrics)  # waits for the call, so that the row has its end time
                 self._write(state, rows, progress)
                 diverged = self._diverged(state)
                 if call % self.config.checkpoint.every_calls == 0:
@@ -122,13 +122,13 @@ class Trainer:
             raise UserError(
                 f"training has diverged: after {call * self.steps_per_call:,} steps the policy of seed "
                 f"{', '.join(map(str, diverged))} is not finite; earlier checkpoints are kept; "
-                "lower the learning rate, or clip gradients"
+                "lower the learning rate or clip gradients, then resume or start a new run"
             )
         return signal_name
 
     def score(self) -> None:
-        """Score every run in the real Gymnasium; see `Recorder.score`. Saves are complete when it returns or raises."""
-        seconds = self._seconds()  # the same for all, whichever is scored first
+        """Score every run in the real Gymnasium with `Recorder.score`. On return or error, all saves are complete."""
+        seconds = self._seconds()  # equal for all runs, in whatever order they are scored
         try:
             for recorder in self.recorders:
                 scores = recorder.score(seconds)
@@ -140,12 +140,12 @@ class Trainer:
                 recorder.wait()
 
     def _start(self) -> tuple[TrainState, int]:
-        """The first TrainState, and the number of calls before it."""
+        """Initial or restored TrainState, and the number of completed calls."""
         keys = [jax.random.PRNGKey(recorder.config.seed) for recorder in self.recorders]
         if not self.config.resume or not any(list_steps(folder.checkpoints) for folder in self._folders):
             for folder in self._folders:
                 if self.config.resume and folder.metrics.exists():
-                    warnings.warn(f"{folder.path} holds no checkpoint; it begins again", stacklevel=2)
+                    warnings.warn(f"{folder.path} has no checkpoint; training restarts from step 0", stacklevel=2)
             return self._program.init(keys), 0
         like = jax.eval_shape(make_init(self._algorithm.init), keys[0])
         restored = [recorder.restore(like) for recorder in self.recorders]
@@ -157,7 +157,7 @@ class Trainer:
         return self._program.merge([state for state, _ in restored]), steps.pop() // self.steps_per_call
 
     def _end(self, state: TrainState, call: int, is_stopped: bool) -> None:
-        """Close the run folders; of a run that stops early, nothing follows that would wait for them."""
+        """Close the run folders. A run that stops early waits for its saves here, since no scoring follows."""
         state = _without_replay(state)
         for recorder, own in zip(self.recorders, self._program.split(state), strict=True):
             recorder.end(own, call * self.steps_per_call)
@@ -174,7 +174,7 @@ class Trainer:
         return [common | name_metrics(own, self._steps_per_iteration) | speed for own in of_runs]
 
     def _write(self, state: TrainState, rows: list[Row], progress: Progress) -> None:
-        """Log and show the rows of a call, and film the policies whose evaluation has ended."""
+        """Log and display the rows of a call. Film the policies whose evaluation has ended."""
         for recorder, row in zip(self.recorders, rows, strict=True):
             recorder.write(row)
             self._warn_of_physics(row)
@@ -190,10 +190,10 @@ class Trainer:
         for metric, warning in physics_warnings(row, self.steps_per_call).items():
             if metric not in self._warned_of:
                 self._warned_of.add(metric)
-                _log.warning(f"{warning}; the count is in the metrics as {metric}")
+                _log.warning(f"{warning}; the metric {metric} has the count")
 
     def _speed(self, call: int) -> float:
-        """Steps per second of each run over about `_SPEED_WINDOW` seconds, evaluation and saving included."""
+        """Steps per second of each run over about `_SPEED_WINDOW` seconds, including evaluation and saving."""
         now = time.monotonic()
         while len(self._times) > 1 and now - self._times[1][0] > _SPEED_WINDOW:
             self._times.popleft()
@@ -217,14 +217,14 @@ class Trainer:
         return sorted(seeds[~self._program.is_finite(state)].tolist())
 
     def _stop_signal(self, interrupt: Interrupt) -> str | None:
-        """The name of the signal that asks to stop, whichever of the processes received it."""
+        """Name of the stop signal, from whichever process received it."""
         number = signal.Signals[interrupt.signal_name].value if interrupt.signal_name else 0
         number = self._program.max_over_processes(number)
         return signal.Signals(number).name if number else None
 
 
 def _without_replay(state: TrainState) -> TrainState:
-    """The state without its replay, which is saved and no longer needed."""
+    """State without its replay buffer, which is already saved."""
     fields = {field.name: () for field in dataclasses.fields(state) if field.metadata.get("replay")}
     return state.replace(**fields)
 

@@ -67,5 +67,5 @@ def test_another_shape_or_version_is_named(tmp_path):
         checkpoint.restore(tmp_path / "x", TREE | {"a": jnp.zeros((2, 4))})
     meta = json.loads((tmp_path / "x" / "meta.json").read_text())
     (tmp_path / "x" / "meta.json").write_text(json.dumps(meta | {"format": 99, "mjx_walk": "9.9"}))
-    with pytest.raises(UserError, match=r"written by mjx_walk 9\.9 in checkpoint format 99"):
+    with pytest.raises(UserError, match=r"has checkpoint format 99, written by mjx_walk 9\.9"):
         checkpoint.restore(tmp_path / "x", TREE)

@@ -90,7 +90,7 @@ def test_a_replay_that_is_gone_is_filled_again(tmp_path):
     flip_a_byte(checkpoint.step_path(tmp_path / "run" / "checkpoints", 6 * TINY_CHUNK))
     before = leaves(tmp_path / "run", 4)
     done = train(tmp_path / "run", "algo=sac", f"total_steps={6 * TINY_CHUNK}", "resume=true", tiny=TINY_OFF_POLICY)
-    assert "has no replay any more; it is filled again" in done.stderr
+    assert "has no replay buffer; training refills it" in done.stderr
     after = leaves(tmp_path / "run", 6)
     assert after["replay.rows"] == 16 and after["iterations"] == 48
     # Two chunks of eight updates, the first seven of which wait for 64 transitions.
@@ -156,7 +156,7 @@ def test_a_run_that_saved_nothing_begins_again(tmp_path):
     whole = leaves(run_dir, 2)
     shutil.rmtree(run_dir / "checkpoints")
     (run_dir / "checkpoints").mkdir()
-    with pytest.warns(UserWarning, match="holds no checkpoint; it begins again"):
+    with pytest.warns(UserWarning, match="has no checkpoint; training restarts from step 0"):
         train_here(run_dir, "resume=true", tiny=[])
     again = leaves(run_dir, 2)
     for name, leaf in whole.items():

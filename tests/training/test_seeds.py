@@ -66,7 +66,7 @@ def test_seeds_side_by_side_resume_exactly_and_each_may_go_on_alone(tmp_path):
     with pytest.raises(AssertionError, match=r"differ in total_steps \(was 128, now 256\); resume each alone"):
         train(tmp_path / "one", "resume=true", SEEDS, tiny=[])
     before = (tmp_path / "one" / "seed_3" / "config.yaml").read_text()
-    with pytest.raises(AssertionError, match=r"error: the seeds stand at different steps \(128, 256\); resume"):
+    with pytest.raises(AssertionError, match=r"error: the seeds are at different steps \(128, 256\); resume"):
         train(tmp_path / "one", f"total_steps={6 * TINY_CHUNK}", "resume=true", SEEDS, tiny=[])
     assert (tmp_path / "one" / "seed_3" / "config.yaml").read_text() == before
 
