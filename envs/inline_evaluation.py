@@ -22,7 +22,7 @@ class EvaluationConfig:
     """Settings of the deterministic evaluation."""
 
     num_envs: int = setting(128, at_least=1)
-    """Environments that play whole episodes without noise; at most as many as train."""
+    """Environments that play complete episodes without noise; at most the number of training environments."""
     every_steps: int = setting(0, at_least=0)
     """Minimum number of environment steps from the start of one round to the start of the next."""
     gymnasium_episodes: int = setting(100, at_least=0)

@@ -44,8 +44,8 @@ TINY_OFF_POLICY = (
     "algo.critic_hidden_layer_sizes=[32,32]",
     "checkpoint.every_calls=2",
 )
-TINY_CHUNK = 8 * 8
-"""Environment steps of a chunk of either."""
+TINY_CALL = 8 * 8
+"""Environment steps of one call, with either list of settings."""
 
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(CLONE)}
@@ -74,9 +74,9 @@ def command_here(module: str, *arguments: str) -> int:
     return ended.value.code
 
 
-def leaves(run_dir, chunk):
+def leaves(run_dir, call):
     with ocp.PyTreeCheckpointer() as checkpointer:
-        path = checkpoint.step_path(run_dir / "checkpoints", chunk * TINY_CHUNK)
+        path = checkpoint.step_path(run_dir / "checkpoints", call * TINY_CALL)
         parts = [checkpointer.restore(part) for part in (path / "arrays", path / "replay") if part.exists()]
     return {name: leaf for part in parts for name, leaf in part.items()}
 

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 import yaml
-from helpers import TINY, TINY_CHUNK, command, command_here
+from helpers import TINY, TINY_CALL, command, command_here
 
 from mjx_walk import api
 from mjx_walk import bench as bench_command
@@ -180,7 +180,7 @@ def test_a_folder_that_is_not_ours_is_left_alone(tmp_path):
 def finished(tmp_path_factory):
     """A tiny run."""
     path = tmp_path_factory.mktemp("runs") / "run"
-    train_command.main([*TINY, f"run_dir={path}", f"total_steps={2 * TINY_CHUNK}"])
+    train_command.main([*TINY, f"run_dir={path}", f"total_steps={2 * TINY_CALL}"])
     return path
 
 
@@ -192,7 +192,7 @@ def test_a_finished_run_is_not_overwritten(finished):
 
 
 def test_resume_names_the_keys_that_differ(finished):
-    same = [*TINY, f"run_dir={finished}", "resume=true", f"total_steps={2 * TINY_CHUNK}"]
+    same = [*TINY, f"run_dir={finished}", "resume=true", f"total_steps={2 * TINY_CALL}"]
     with pytest.raises(UserError) as error:
         train_command.main([*same, "algo.discount=0.5", "seed=9"])
     assert "algo.discount (was 0.99, now 0.5)" in str(error.value) and "seed (was 0, now 9)" in str(error.value)
@@ -200,7 +200,7 @@ def test_resume_names_the_keys_that_differ(finished):
         train_command.main([f"run_dir={finished}", "resume=true", "checkpoint.keep=5"])
     assert str(error.value).endswith(": checkpoint.keep (was 3, now 5)")
     with pytest.raises(UserError, match="may only grow"):
-        train_command.main([*same[:-1], f"total_steps={TINY_CHUNK}"])
+        train_command.main([*same[:-1], f"total_steps={TINY_CALL}"])
     with pytest.raises(UserError, match=r"env\.name \(was walker2d, now humanoid\)"):
         train_command.main([*same, "env=humanoid"])
 

@@ -1,4 +1,4 @@
-"""What README tells people to type."""
+"""The commands and code of the documentation."""
 
 import re
 import shlex
@@ -70,7 +70,7 @@ def test_own_body(tmp_path, monkeypatch):
 
 
 def test_commands_of_the_tables_are_recipes():
-    """Those behind the scores, whose recipes are for a GPU."""
+    """The commands of the scores, whose recipes are for a GPU."""
     commands = re.findall(r"\| `(env=[^`]+)` \|$", RESULTS, flags=re.MULTILINE)
     commands += re.findall(r"\| `python -m mjx_walk\.train (env=[^`]+)` \|$", RESULTS, flags=re.MULTILINE)
     assert len(commands) > 25 and zoo.table() in RESULTS

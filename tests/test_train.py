@@ -7,7 +7,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from helpers import TINY, TINY_CHUNK, command_here
+from helpers import TINY, TINY_CALL, command_here
 from tensorboardX.proto.event_pb2 import Event
 
 import mjx_walk
@@ -21,7 +21,7 @@ def finished(tmp_path_factory):
     """A small run through the Python interface, with the rows it reported."""
     rows = []
     path = tmp_path_factory.mktemp("runs") / "run"
-    overrides = [*TINY, f"run_dir={path}", f"total_steps={60 * TINY_CHUNK}", "env.max_episode_steps=40"]
+    overrides = [*TINY, f"run_dir={path}", f"total_steps={60 * TINY_CALL}", "env.max_episode_steps=40"]
     run = mjx_walk.run([*overrides, "evaluation.gymnasium_episodes=3"], on_metrics=rows.append)
     return run, rows
 
@@ -34,13 +34,13 @@ def test_the_folder_holds_what_it_should(finished):
         assert (run.path / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
         assert (run.path / name).stat().st_size > 10_000
     steps = sorted(path.name for path in (run.path / "checkpoints").iterdir())
-    assert steps == [f"{chunk * TINY_CHUNK:013d}" for chunk in (56, 58, 60)] + ["best"]
+    assert steps == [f"{call * TINY_CALL:013d}" for call in (56, 58, 60)] + ["best"]
 
 
 def test_metrics_name_everything(finished):
     run, rows = finished
     assert run.metrics == json.loads(json.dumps(rows))
-    assert [row["env_steps"] for row in rows] == [TINY_CHUNK * (i + 1) for i in range(60)]
+    assert [row["env_steps"] for row in rows] == [TINY_CALL * (i + 1) for i in range(60)]
     needed = {
         "episode/return", "episode/length", "episode/reward_forward", "episode/reward_ctrl", "episode/reward_survive",
         "train/loss", "train/policy_loss", "train/value_loss", "train/kl", "train/entropy", "train/learning_rate",
@@ -112,7 +112,7 @@ def test_eval_command(finished, capsys):
 
 def test_a_sweep_puts_each_job_in_its_own_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    arguments = [*TINY, f"total_steps={TINY_CHUNK}"]
+    arguments = [*TINY, f"total_steps={TINY_CALL}"]
     assert command_here("train", "-m", "seed=0,1", *arguments) == 0
     assert len(list(tmp_path.glob("runs/sweeps/*/*/metrics.jsonl"))) == 2
     # One job of a sweep that fails does not end the others.
@@ -125,14 +125,14 @@ def test_a_sweep_puts_each_job_in_its_own_folder(tmp_path, monkeypatch, capsys):
 def test_a_signal_ends_a_sweep(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(trainer.Trainer, "_stop_signal", lambda self, interrupt: "SIGTERM")
-    assert command_here("train", "-m", "seed=0,1", *TINY, f"total_steps={TINY_CHUNK}") == 143
+    assert command_here("train", "-m", "seed=0,1", *TINY, f"total_steps={TINY_CALL}") == 143
     assert len(list(tmp_path.glob("runs/sweeps/*/*/config.yaml"))) == 1
     assert capsys.readouterr().err.splitlines()[-1] == "Stopped by SIGTERM."
 
 
 def test_a_model_is_found_from_another_folder_and_a_number_is_a_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    arguments = [*TINY, f"total_steps={TINY_CHUNK}", "env.xml_file=mine.xml", "run_dir=2026_11_23"]
+    arguments = [*TINY, f"total_steps={TINY_CALL}", "env.xml_file=mine.xml", "run_dir=2026_11_23"]
     theirs = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "walker2d.xml"
     (tmp_path / "mine.xml").write_text(theirs.read_text())
     assert command_here("train", *arguments) == 0

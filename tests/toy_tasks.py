@@ -10,7 +10,7 @@ from mjx_walk.envs.physics import PhysicsState
 
 
 class ToyTask(TrainableTask):
-    """What the trainer reads of a `Task`, for one action in `[-1, 1]`; the whole state is `qpos` and `qvel`."""
+    """What the trainer reads of a `Task`, for one action in `[-1, 1]`. The state is `qpos` and `qvel`."""
 
     action_size = 1
     action_low, action_high = jnp.float32([-1.0]), jnp.float32([1.0])
@@ -145,7 +145,7 @@ class MountainCar(ToyTask):
 
 
 class BraxSizes(Env):
-    """Tells Brax's trainer the sizes; its transitions come from our own environment."""
+    """Sizes for Brax's trainer. Its transitions come from our own environment."""
 
     observation_size, action_size, backend = 17, 6, "mjx"
 

@@ -40,7 +40,7 @@ class OffPolicyConfig:
     """Critic updates for each policy update."""
     batch_size: int = setting(4096, at_least=1)
     replay_capacity: int = setting(1_000_000, at_least=1)
-    """Transitions, rounded up to whole unrolls."""
+    """Transitions, rounded up to complete unrolls."""
     replay_dtype: str = setting("float32", choices=("float32", "bfloat16"))
     """Dtype of the stored observations."""
     learning_starts: int = setting(10_000, at_least=0)

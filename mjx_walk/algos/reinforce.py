@@ -90,7 +90,7 @@ class REINFORCE(PolicyGradientAlgorithm):
 _LARGEST = 5.0
 """Bound of features in the fit, in standard deviations, so that no few of them dominate it."""
 _RIDGE = 1e-2
-"""Small beside the features' variance of 1, and enough for features that say the same in 32-bit floats."""
+"""Small compared with the features' variance of 1, and large enough for duplicate features in float32."""
 
 
 def linear_fit(obs: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:

@@ -75,13 +75,13 @@ class ReplayBuffer:
 
     def init(self) -> Replay:
         """An empty buffer."""
-        rows, copies = self.num_rows, self.num_envs
+        rows, envs = self.num_rows, self.num_envs
         return Replay(
-            observation=jnp.zeros((rows + self.num_slots, copies, self.task.observation_size), self.observation_dtype),
-            action=jnp.zeros((rows, copies, self.task.action_size), jnp.float32),
-            reward=jnp.zeros((rows, copies), jnp.float32),
-            end=jnp.zeros((rows, copies), jnp.int16 if _FIRST_CUT + self.num_slots < 2**15 else jnp.int32),
-            cuts=jnp.zeros(copies, jnp.int32),
+            observation=jnp.zeros((rows + self.num_slots, envs, self.task.observation_size), self.observation_dtype),
+            action=jnp.zeros((rows, envs, self.task.action_size), jnp.float32),
+            reward=jnp.zeros((rows, envs), jnp.float32),
+            end=jnp.zeros((rows, envs), jnp.int16 if _FIRST_CUT + self.num_slots < 2**15 else jnp.int32),
+            cuts=jnp.zeros(envs, jnp.int32),
             rows=jnp.zeros((), jnp.int32),
         )
 
@@ -105,8 +105,8 @@ class ReplayBuffer:
             is_cut, slot, last = step
             # Rows beyond the array's end are dropped.
             row = jnp.where(is_cut, self.num_rows + slot, observation.shape[0])
-            copy = jnp.arange(self.num_envs)
-            return observation.at[row, copy].set(last.astype(observation.dtype), mode="drop"), None
+            env = jnp.arange(self.num_envs)
+            return observation.at[row, env].set(last.astype(observation.dtype), mode="drop"), None
 
         observation = write(replay.observation, steps.observation)
         observation, _ = jax.lax.scan(keep_cut, observation, (truncated, slot, steps.next_observation))
@@ -141,19 +141,19 @@ class ReplayBuffer:
         row_key, copy_key = jax.random.split(key)
         written = jnp.minimum(replay.rows, self.num_rows)
         age = jax.random.randint(row_key, (batch_size,), 0, written - n_step)
-        copy = jax.random.randint(copy_key, (batch_size,), 0, self.num_envs)
+        env = jax.random.randint(copy_key, (batch_size,), 0, self.num_envs)
         first = replay.rows - written + age
         on_the_way = (first + jnp.arange(n_step)[:, None]) % self.num_rows
-        ends = replay.end[on_the_way, copy].astype(jnp.int32)
-        reward, length = n_step_return(replay.reward[on_the_way, copy], ends != _GOES_ON, discount)
+        ends = replay.end[on_the_way, env].astype(jnp.int32)
+        reward, length = n_step_return(replay.reward[on_the_way, env], ends != _GOES_ON, discount)
         end = jnp.take_along_axis(ends, length[None] - 1, axis=0)[0]
         next_row = jnp.where(end >= _FIRST_CUT, self.num_rows + end - _FIRST_CUT, (first + length) % self.num_rows)
         first = first % self.num_rows
         return Transition(
-            observation=replay.observation[first, copy].astype(jnp.float32),
-            action=replay.action[first, copy],
+            observation=replay.observation[first, env].astype(jnp.float32),
+            action=replay.action[first, env],
             reward=reward,
             discount=jnp.where(end == _TERMINATED, 0.0, discount**length),
-            next_observation=replay.observation[next_row, copy].astype(jnp.float32),
+            next_observation=replay.observation[next_row, env].astype(jnp.float32),
             extras={"state_extras": {"truncation": jnp.zeros(batch_size)}},
         )

@@ -76,7 +76,7 @@ def returns_to_go(
 class ReturnScale(flax.struct.PyTreeNode):
     """Running variance and bound of the discounted return, by which rewards may be normalised.
 
-    Source: `VecNormalize` of Stable-Baselines3 (`r / std(G)`, with `G ← γ G + r` running through each copy).
+    Source: `VecNormalize` of Stable-Baselines3 (`r / std(G)`, with `G ← γ G + r` running through each environment).
     """
 
     running_return: jax.Array = flax.struct.field(metadata=PER_DEVICE)

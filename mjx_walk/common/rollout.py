@@ -1,4 +1,4 @@
-"""Run a policy: collect training data, or play whole episodes."""
+"""Run a policy: collect training data, or play complete episodes."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -58,7 +58,7 @@ def unroll(
 
 
 def evaluate(task: Task, num_episodes: int, policy: PolicyFn, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Play whole episodes in one batch.
+    """Play complete episodes in one batch.
 
     Args:
         task: the unbatched environment.

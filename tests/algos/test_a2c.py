@@ -61,7 +61,7 @@ def test_the_loss_is_the_sum_of_its_parts_and_rewards_entropy():
 
 
 def test_correlated_noise_reaches_the_environment():
-    """The policy is held at 0, nearly without noise of its own, so that the last reward tells the noise."""
+    """The policy acts 0 with almost no noise of its own, so the last reward shows the correlated noise."""
     _, _, state, batch = collected(RewardedAction(), init_noise_std=1e-6, ou_noise_std=0.2)
     assert state.exploration.shape == (NUM_ENVS, 1) and np.asarray(state.exploration).std() > 0.1
     acted = jnp.clip(state.exploration[:, 0], -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""What the off-policy loop hands its learner, told by one that does nothing else."""
+"""What the off-policy loop passes to its learner, reported by one that learns nothing."""
 
 import dataclasses
 
@@ -51,7 +51,7 @@ class Reporter(OffPolicyAlgorithm):
     full_update = critic_update
 
 
-def told(task, num_updates, **changes):
+def iterate(task, num_iterations, **changes):
     """Algorithm, state and the metrics of all iterations of `Reporter`."""
     settings = {
         "unroll_length": 2,
@@ -63,9 +63,9 @@ def told(task, num_updates, **changes):
     config = OffPolicyConfig(**settings | changes)
     algorithm = Reporter(task, NUM_ENVS, EvaluationConfig(1), config)
     state, rows = algorithm.init(jax.random.PRNGKey(0)), []
-    update = jax.jit(lambda state: algorithm.learn(*algorithm.collect(state)))
-    for _ in range(num_updates):
-        state, metrics = update(state)
+    iteration = jax.jit(lambda state: algorithm.learn(*algorithm.collect(state)))
+    for _ in range(num_iterations):
+        state, metrics = iteration(state)
         rows.append(values(metrics))
     return algorithm, state, {name: np.stack([row[name] for row in rows]) for name in metrics}
 
@@ -73,23 +73,25 @@ def told(task, num_updates, **changes):
 @pytest.mark.parametrize(("schedule", "rates"), [("linear", [1.0, 0.75, 0.5, 0.25, 0.0]), ("constant", [1.0] * 5)])
 def test_learning_rates_follow_their_schedule(schedule, rates):
     settings = {"learning_rate_schedule": schedule, "schedule_steps": 4 * 2 * NUM_ENVS}
-    _, _, metrics = told(EndlessReward(), 5, **settings)
+    _, _, metrics = iterate(EndlessReward(), 5, **settings)
     np.testing.assert_allclose(metrics["rate"], rates)
 
 
 def test_normalised_rewards_keep_the_largest_return_within_its_bound():
     """A reward of 1 at each step for 10 steps: the largest discounted return is more than the std of all."""
-    _, state, metrics = told(EndlessReward(10), 12, normalize_rewards=True, normalized_return_max=0.5, reward_scale=2.0)
+    _, state, metrics = iterate(
+        EndlessReward(10), 12, normalize_rewards=True, normalized_return_max=0.5, reward_scale=2.0
+    )
     largest = float(state.return_scale.largest)
     assert largest == pytest.approx(sum(0.99**i for i in range(10)), rel=1e-5)
     assert metrics["scale"][-1] == pytest.approx(2.0 * 0.5 / largest, rel=1e-5)
-    _, state, metrics = told(EndlessReward(10), 12, reward_scale=2.0)
+    _, state, metrics = iterate(EndlessReward(10), 12, reward_scale=2.0)
     np.testing.assert_array_equal(metrics["scale"], 2.0)
 
 
 def test_actions_are_random_until_the_replay_is_filled():
     """The policy acts 0 on this task."""
-    _, state, _ = told(EndlessReward(), 3, learning_starts=2 * 2 * NUM_ENVS)
+    _, state, _ = iterate(EndlessReward(), 3, learning_starts=2 * 2 * NUM_ENVS)
     actions = np.asarray(state.replay.action[:6])
     assert (actions[:4] != 0.0).all() and len(np.unique(actions[:4])) == 4 * NUM_ENVS
     np.testing.assert_array_equal(actions[4:], 0.0)
@@ -97,7 +99,7 @@ def test_actions_are_random_until_the_replay_is_filled():
 
 @pytest.mark.parametrize(("clip", "seen"), [(0.5, 0.5), (None, 1000.0)])
 def test_observations_are_clipped_where_the_policy_acts_and_where_it_learns(clip, seen):
-    algorithm, state, metrics = told(FarAway(), 2, observation_clip=clip, normalize_observations=False)
+    algorithm, state, metrics = iterate(FarAway(), 2, observation_clip=clip, normalize_observations=False)
     assert metrics["largest_observation"][-1] == seen
     assert float(jnp.abs(state.replay.action[:4]).max()) == pytest.approx(0.01 * seen)
     acted = algorithm.policy(algorithm.policy_params(state))(jnp.full((1, 1), 60.0), jax.random.PRNGKey(0))

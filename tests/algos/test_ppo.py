@@ -90,7 +90,7 @@ def test_ppo_update_equals_brax(monkeypatch):
 
 @pytest.mark.parametrize("physics", ["jax", pytest.param("warp", marks=pytest.mark.slow), "c"])
 def test_small_batch_training_learns(physics):
-    """Sixteen copies of a walker that is paid for standing learn to stand longer, on every engine."""
+    """Sixteen walkers that are rewarded for standing learn to stand longer, on every engine."""
     task = make_env("walker2d", physics=physics, forward_reward_weight=0.0)
     config = dataclasses.replace(SMALL, unroll_length=32, num_epochs=8, learning_rate=3e-3, discount=0.95)
     algorithm = PPO(task, 16, EvaluationConfig(2), config)
@@ -178,13 +178,13 @@ def test_the_values_gradient_is_clipped_to_its_own_norm():
 
 
 def test_the_entropy_bonus_falls_and_rewards_are_normalised_by_what_was_seen_before(monkeypatch):
-    """As Brax's loss is told them; the metrics carry it out."""
+    """The arguments of Brax's loss, which a fake loss returns as metrics."""
 
     def loss(params, *_, entropy_cost, reward_scaling, **__):
         names = ("total_loss", "kl_mean", "policy_dist_mean_std")
         zero = jnp.float32(0.0)
-        told = {"v_loss": jnp.float32(entropy_cost), "policy_loss": jnp.float32(reward_scaling)}
-        return zero, dict.fromkeys(names, zero) | told
+        arguments = {"v_loss": jnp.float32(entropy_cost), "policy_loss": jnp.float32(reward_scaling)}
+        return zero, dict.fromkeys(names, zero) | arguments
 
     monkeypatch.setattr("mjx_walk.common.brax_losses.ppo_losses.compute_ppo_loss", loss)
     settings = {

@@ -15,7 +15,7 @@ from mjx_walk.common import networks
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.training.programs import make_init, make_step
 
-# A chunk that is vmapped cannot reuse its input's memory.
+# A vmapped call cannot reuse its input's memory.
 pytestmark = pytest.mark.filterwarnings("ignore:Some donated buffers")
 
 DISCOUNT = 0.5
@@ -81,7 +81,7 @@ def values(name, task, config, state, obs):
 
 
 def train(name, task, **changes):
-    """Value and action at a few observations after training, and whether the numbers were sound."""
+    """Value and action at a few observations after training, and whether the metrics are finite."""
     make, config_class = ALGORITHMS[name]
     config = config_class(**SETTINGS[name] | changes)
     algorithm = make(task, 32, EvaluationConfig(1), config)
@@ -97,8 +97,8 @@ def trained(name):
     """Value and action by the toy task. Compiled once, which is what takes long here."""
     indices = jnp.arange(len(toy_tasks.OneOf.TASKS))
     found = jax.vmap(lambda index: train(name, toy_tasks.OneOf(index)))(indices)
-    value, action, sound = jax.tree.map(np.asarray, found)
-    assert sound.all()
+    value, action, finite = jax.tree.map(np.asarray, found)
+    assert finite.all()
     return dict(zip(toy_tasks.OneOf.TASKS, zip(value, action, strict=True), strict=True))
 
 

@@ -12,7 +12,7 @@ from mjx_walk.common import networks
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 
 NUM_ENVS, STEPS, LEARNED = 16, 6, 4
-# What follows the piece counts 0.5³ at the fourth step and 0.5² at the fifth.
+# The tail beyond the unroll has discount 0.5³ at the fourth step and 0.5² at the fifth.
 SETTINGS = {
     "unroll_length": STEPS,
     "normalizer_warmup_steps_per_env": 0,
@@ -32,7 +32,7 @@ def learned(task, **changes):
 
 
 def test_loss_over_the_steps_whose_future_was_seen():
-    """Episodes that end at a piece's last steps are no reason to learn from these."""
+    """The last steps of an unroll are left out, even if their episode ends there."""
     config, state, batch, metrics = learned(DelayedReward(), init_at_random_episode_step=False)
     steps, nets = batch.transitions, networks.make_ppo_networks(DelayedReward(), config)
     assert (np.asarray(steps.discount)[:, LEARNED:] == 0.0).any()
@@ -47,7 +47,7 @@ def test_loss_over_the_steps_whose_future_was_seen():
 
 
 def test_steps_just_before_a_time_limit_are_left_out():
-    """Of a limit of six steps, whose start is staggered, four of six may learn at any place of a piece."""
+    """With a limit of six steps and random first episode steps, four of six steps count anywhere in an unroll."""
     _, _, batch, metrics = learned(EndlessReward(6))
     cut = np.asarray(batch.transitions.extras["state_extras"]["truncation"]) > 0.0
     seen = np.ones((NUM_ENVS, LEARNED), bool)
@@ -73,7 +73,7 @@ def test_linear_baseline_is_the_least_squares_fit():
 
 
 def test_linear_baseline_bears_observations_that_say_the_same():
-    """Constants, copies of one another, and sizes as the humanoid's first observations have them."""
+    """Constants, duplicates, and the scales of the humanoid's first observations."""
     keys = jax.random.split(jax.random.PRNGKey(0), 2)
     varied = jax.random.normal(keys[0], (64, 64, 20)) * jnp.logspace(-3, 2, 20)
     obs = jnp.concatenate([varied, varied, 3.0 * varied, jnp.full((64, 64, 100), 8.3), jnp.zeros((64, 64, 160))], -1)

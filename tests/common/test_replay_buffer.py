@@ -19,7 +19,7 @@ def test_n_step_return_by_hand():
 
 
 class Counter(toy_tasks.ToyTask):
-    """The observation names the copy, the episode and the step; one in eight actions ends the episode."""
+    """The observation identifies the environment, the episode and the step; one in eight actions ends the episode."""
 
     observation_size = 3
 
@@ -49,13 +49,13 @@ def play(num_envs, num_steps, limit, seed=0):
 @pytest.mark.parametrize("n_step", [1, 3])
 def test_samples_are_true_transitions_at_any_fill(limit, n_step):
     """Every field of every sample, next observations across episode ends included, while the buffer goes round."""
-    copies, rows, unroll, discount = 4, 12, 2, 0.9
-    obs, action, reward, terminated, truncated, next_obs = play(copies, 60, limit)
-    buffer = ReplayBuffer(Counter(limit), copies, rows)
+    num_envs, rows, unroll, discount = 4, 12, 2, 0.9
+    obs, action, reward, terminated, truncated, next_obs = play(num_envs, 60, limit)
+    buffer = ReplayBuffer(Counter(limit), num_envs, rows)
     insert = jax.jit(buffer.insert, donate_argnums=0)
     sample = jax.jit(lambda replay, key: buffer.sample(replay, key, 1024, n_step, discount))
     replay = buffer.init()
-    at = {tuple(obs[t, b]): (t, b) for t in range(60) for b in range(copies)}
+    at = {tuple(obs[t, b]): (t, b) for t in range(60) for b in range(num_envs)}
     num_truncated = 0
     for start in range(0, 60, unroll):
         part = slice(start, start + unroll)
@@ -68,7 +68,7 @@ def test_samples_are_true_transitions_at_any_fill(limit, n_step):
         drawn = jax.tree.map(np.asarray, sample(replay, jax.random.PRNGKey(start)))
         begins = {at[tuple(row)] for row in drawn.observation}
         oldest = max(0, written - rows)
-        assert begins == {(t, b) for t in range(oldest, written - n_step) for b in range(copies)}
+        assert begins == {(t, b) for t in range(oldest, written - n_step) for b in range(num_envs)}
         for i, row in enumerate(drawn.observation):
             t, b = at[tuple(row)]
             total, last = 0.0, t

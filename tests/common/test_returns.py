@@ -15,7 +15,7 @@ from mjx_walk.common.returns import (
 
 def test_truncation_bootstraps_and_termination_does_not():
     """Brax's GAE, fed as `on_policy.collect` feeds it, against sums done by hand. γ = 0.5, λ = 1, values all 8."""
-    reward = jnp.array([[1.0, 1.0, 1.0]] * 2)  # [T=2, B=3]: goes on, truncated at 0, terminated at 0
+    reward = jnp.array([[1.0, 1.0, 1.0]] * 2)  # [T=2, B=3]: continues, truncated at 0, terminated at 0
     truncated = jnp.array([[False, True, False], [False, False, False]])
     ended = jnp.array([[0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
     scale = 2.0
@@ -40,7 +40,7 @@ def test_return_scale_is_the_std_of_discounted_returns():
     reward = rng.normal(3.0, 2.0, (50, 4)).astype(np.float32)
     done = rng.random((50, 4)) < 0.1
     scale = init_return_scale(4)
-    for block in range(5):  # in pieces, as collected
+    for block in range(5):  # one unroll at a time
         part = slice(10 * block, 10 * block + 10)
         scale = update_return_scale(scale, jnp.asarray(reward[part]), jnp.asarray(done[part]), 0.9)
     running, returns = np.zeros(4), []
@@ -56,7 +56,7 @@ def test_return_scale_is_the_std_of_discounted_returns():
 
 
 def test_returns_to_go_by_hand():
-    """Three copies: one terminates after the second step, one is cut off there, one goes on."""
+    """Three environments: one terminates after the second step, one is truncated there, one continues."""
     reward = jnp.float32([[1.0, 1.0, 1.0], [2.0, 2.0, 2.0], [4.0, 4.0, 4.0]])
     terminated = jnp.array([[False, False, False], [True, False, False], [False, False, False]])
     truncated = jnp.array([[False, False, False], [False, True, False], [False, False, False]])

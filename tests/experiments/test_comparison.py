@@ -229,7 +229,7 @@ def test_seeds_that_stand_at_the_same_step_are_trained_together(tmp_path):
 
 
 class FakeProcess:
-    """A run that goes on until it is told to stop."""
+    """A run that continues until a signal stops it."""
 
     def __init__(self, code=None):
         self.code, self.signals = code, []

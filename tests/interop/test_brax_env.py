@@ -1,4 +1,4 @@
-"""The tasks behind Brax's interface."""
+"""The tasks through Brax's interface."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The tasks behind Gymnasium's interface."""
+"""The tasks through Gymnasium's interface."""
 
 import gymnasium
 import numpy as np
@@ -59,7 +59,7 @@ def test_there_is_one_time_limit():
 
 @pytest.mark.parametrize("physics", ["c", pytest.param("jax", marks=pytest.mark.slow)])
 def test_many_side_by_side(physics):
-    """Copies that fall, and copies that meet the limit, begin again at once; what they saw last is in `final_obs`."""
+    """Environments that fall or reach the limit reset in the same step. Their last observation is in `final_obs`."""
     envs = gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=6, physics=physics, max_episode_steps=20)
     obs, _ = envs.reset(seed=1)
     again, _ = envs.reset(seed=1)
@@ -74,11 +74,11 @@ def test_many_side_by_side(physics):
         over = terminated | truncated
         assert reward.shape == (6,) and info["reward_forward"].shape == (6,)
         assert (ages[over] <= 20).all() and (ages[truncated] == 20).all() and (ages[~over] < 20).all()
-        for copy in np.flatnonzero(over):
-            last = info["final_obs"][copy]
+        for i in np.flatnonzero(over):
+            last = info["final_obs"][i]
             z, angle = last[0], last[1]
-            assert truncated[copy] or not (healthy_z[0] < z < healthy_z[1] and abs(angle) < 1.0)
-            assert abs(obs[copy, 0] - 1.25) < 0.01 and info["_final_obs"][copy]
+            assert truncated[i] or not (healthy_z[0] < z < healthy_z[1] and abs(angle) < 1.0)
+            assert abs(obs[i, 0] - 1.25) < 0.01 and info["_final_obs"][i]
         fell, cut = fell + terminated.sum(), cut + truncated.sum()
         ages[over] = 0
     assert fell >= 2 and cut >= 2
@@ -99,7 +99,7 @@ def test_stable_baselines3_trains_on_it():
     """PPO of another library, with its defaults: episodes get longer and better, on Gymnasium's own task, too."""
     stable_baselines3 = pytest.importorskip("stable_baselines3", reason="pip install stable-baselines3")
     evaluate_policy = stable_baselines3.common.evaluation.evaluate_policy
-    pytest.importorskip("torch").set_num_threads(1)  # more of them wait for each other beside another test
+    pytest.importorskip("torch").set_num_threads(1)  # several threads wait for each other while another test runs
     env = gymnasium.make("mjx_walk/Walker2d-v5", physics="c")
     model = stable_baselines3.PPO("MlpPolicy", env, seed=0, device="cpu", verbose=0)
     real = stable_baselines3.common.monitor.Monitor(gymnasium.make("Walker2d-v5"))

@@ -5,7 +5,7 @@ import json
 import subprocess
 
 import pytest
-from helpers import TINY, TINY_CHUNK, command
+from helpers import TINY, TINY_CALL, command
 from wandb.proto.wandb_internal_pb2 import Record
 
 import mjx_walk.api
@@ -14,16 +14,16 @@ from mjx_walk.utils.errors import UserError
 
 
 def records(data):
-    """W&B's file: a header of 7 bytes, then records in LevelDB's log format, pieced together over blocks of 32 KiB."""
+    """W&B's file: a header of 7 bytes, then records in LevelDB's log format, split over blocks of 32 KiB."""
     at, parts = 7, b""
     while at + 7 <= len(data):
-        if 32768 - at % 32768 < 7:  # too little room for a piece's header
+        if 32768 - at % 32768 < 7:  # too little room for a fragment's header
             at += 32768 - at % 32768
             continue
         size, kind = int.from_bytes(data[at + 4 : at + 6], "little"), data[at + 6]
         parts += data[at + 7 : at + 7 + size]
         at += 7 + size
-        if kind in (1, 4):  # a whole record, or a last piece
+        if kind in (1, 4):  # a complete record, or its last fragment
             yield Record.FromString(parts)
             parts = b""
 
@@ -39,12 +39,12 @@ def history(path):
     return rows
 
 
-def test_rows_are_logged_and_a_resumed_run_goes_on_in_the_same_one(tmp_path, monkeypatch):
+def test_rows_are_logged_and_a_resumed_run_continues_the_same_one(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
     arguments = [*TINY, f"run_dir={tmp_path}/run", "wandb_project=walking"]
-    mjx_walk.run([*arguments, f"total_steps={3 * TINY_CHUNK}"])
-    run = mjx_walk.run([*arguments, f"total_steps={6 * TINY_CHUNK}", "resume=true"])
+    mjx_walk.run([*arguments, f"total_steps={3 * TINY_CALL}"])
+    run = mjx_walk.run([*arguments, f"total_steps={6 * TINY_CALL}", "resume=true"])
     files = sorted((tmp_path / "run" / "wandb").glob("offline-run-*/run-*.wandb"))
     identity = (tmp_path / "run" / "wandb_id.txt").read_text()
     assert len(files) == 2 and {path.stem for path in files} == {f"run-{identity}"}

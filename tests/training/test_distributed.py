@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENVIRONMENT, TINY, TINY_CHUNK, TINY_OFF_POLICY, command
+from helpers import ENVIRONMENT, TINY, TINY_CALL, TINY_OFF_POLICY, command
 from toy_tasks import ObservedReward
 
 from mjx_walk.algos import make_algorithm
@@ -30,8 +30,8 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import mark_flags
 
 KEY = jax.random.PRNGKey(0)
-CHUNK = 2 * TINY_CHUNK
-"""Environment steps of a chunk on two devices."""
+CALL = 2 * TINY_CALL
+"""Environment steps of one call on two devices."""
 
 
 def halves(tree):
@@ -99,10 +99,10 @@ def test_running_statistics_are_of_all_devices():
     def update(scale, reward, ended):
         return returns.update_return_scale(scale, reward, ended, 0.9, DEVICES)
 
-    whole = returns.update_return_scale(returns.init_return_scale(8), reward, ended, 0.9)
+    full = returns.update_return_scale(returns.init_return_scale(8), reward, ended, 0.9)
     parts = jax.vmap(update, axis_name=DEVICES)(twice(returns.init_return_scale(4)), by_copy(reward), by_copy(ended))
     for name in ("count", "mean", "variance"):
-        np.testing.assert_allclose(getattr(parts, name)[0], getattr(whole, name), rtol=1e-4)
+        np.testing.assert_allclose(getattr(parts, name)[0], getattr(full, name), rtol=1e-4)
 
 
 def test_what_a_device_gathers_stays_in_the_memory_of_what_it_had_gathered_before():
@@ -154,26 +154,26 @@ def own_leaves(tiny):
 @pytest.mark.slow
 @pytest.mark.parametrize("tiny", [TINY, (*TINY_OFF_POLICY, "algo=sac")])
 def test_two_processes_learn_the_same_and_resume_exactly(tmp_path, tiny):
-    scored = run(tmp_path / "whole", f"total_steps={4 * CHUNK}", "evaluation.gymnasium_episodes=1", tiny=tiny)
+    scored = run(tmp_path / "full", f"total_steps={4 * CALL}", "evaluation.gymnasium_episodes=1", tiny=tiny)
     assert "2 ×" in scored.stdout and "In the real Gymnasium" in scored.stdout
-    first, second = newest(tmp_path / "whole")
+    first, second = newest(tmp_path / "full")
     is_own = own_leaves(tiny)
     for name, leaf in first.items():
         assert is_own[name] or np.array_equal(leaf, second[name]), name
     assert not np.array_equal(first["env.env.obs"], second["env.env.obs"])
-    assert [row["env_steps"] for row in read_rows(tmp_path / "whole" / "metrics.jsonl")] == [
-        CHUNK,
-        2 * CHUNK,
-        3 * CHUNK,
-        4 * CHUNK,
+    assert [row["env_steps"] for row in read_rows(tmp_path / "full" / "metrics.jsonl")] == [
+        CALL,
+        2 * CALL,
+        3 * CALL,
+        4 * CALL,
     ]
-    run(tmp_path / "parted", f"total_steps={2 * CHUNK}", tiny=tiny)
-    run(tmp_path / "parted", f"total_steps={4 * CHUNK}", "resume=true", tiny=tiny)
-    for one, two in zip(newest(tmp_path / "whole"), newest(tmp_path / "parted"), strict=True):
+    run(tmp_path / "parted", f"total_steps={2 * CALL}", tiny=tiny)
+    run(tmp_path / "parted", f"total_steps={4 * CALL}", "resume=true", tiny=tiny)
+    for one, two in zip(newest(tmp_path / "full"), newest(tmp_path / "parted"), strict=True):
         for name, leaf in one.items():
             np.testing.assert_array_equal(leaf, two[name], err_msg=name)
     for devices in (1, 3) if tiny is TINY else (3,):
-        run(tmp_path / "parted", f"total_steps={(4 + 2 * devices) * CHUNK}", "resume=true", tiny=tiny, devices=devices)
+        run(tmp_path / "parted", f"total_steps={(4 + 2 * devices) * CALL}", "resume=true", tiny=tiny, devices=devices)
 
 
 def start(*arguments):
@@ -195,9 +195,9 @@ def wait_until(is_so):
 
 
 @pytest.mark.slow
-def test_a_process_that_dies_ends_the_run_which_goes_on_from_its_checkpoint(tmp_path):
+def test_a_process_that_fails_ends_the_run_which_resumes_from_its_checkpoint(tmp_path):
     settings = [f"run_dir={tmp_path}/run", "devices=2"]
-    parent = start(*settings, "checkpoint.every_calls=1", f"total_steps={60 * CHUNK}")
+    parent = start(*settings, "checkpoint.every_calls=1", f"total_steps={60 * CALL}")
     second = tmp_path / "run" / "checkpoints" / "device_1"
     wait_until(lambda: len(list(second.glob("0*"))) >= 2)
     children = subprocess.run(["pgrep", "-P", str(parent.pid)], capture_output=True, text=True, check=True)
@@ -207,7 +207,7 @@ def test_a_process_that_dies_ends_the_run_which_goes_on_from_its_checkpoint(tmp_
     assert not (tmp_path / "run" / "eval_gymnasium.json").exists()
     done = command("train", *settings, "resume=true")
     assert done.returncode == 0, done.stderr
-    assert read_rows(tmp_path / "run" / "metrics.jsonl")[-1]["env_steps"] == 60 * CHUNK
+    assert read_rows(tmp_path / "run" / "metrics.jsonl")[-1]["env_steps"] == 60 * CALL
 
 
 @pytest.mark.slow

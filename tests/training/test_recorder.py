@@ -1,4 +1,4 @@
-"""Which policy a run leaves behind."""
+"""Which policy a run keeps."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ TINY = [
 
 @pytest.fixture
 def run(tmp_path):
-    """Recorder, algorithm, first state and folder of a run of four steps an update."""
+    """Recorder, algorithm, first state and folder of a run with four steps per iteration."""
     config = load_config(TINY)
     task = make_task(config)
     algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
@@ -73,7 +73,7 @@ def test_the_best_policy_is_saved_once_evaluated_and_not_again_while_it_stays(ru
 
 @pytest.mark.parametrize(("last", "best", "env_steps"), [(5.0, 9.0, 20), (9.0, 5.0, 80)])
 def test_of_the_last_policy_and_the_best_one_gymnasium_chooses(run, monkeypatch, last, best, env_steps):
-    """The last one's score is below the other's 10 in the evaluations beside training, so that both are scored."""
+    """The last policy scores below the best one's inline evaluation of 10, so both are scored."""
     recorder, algorithm, state, folder = run
     state, best_params = with_best(algorithm, state, best_return=10.0, best_iteration=5)
     last_params = algorithm.policy_params(state)

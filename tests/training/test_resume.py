@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 import pytest
-from helpers import TINY, TINY_CHUNK, TINY_OFF_POLICY, command_here, flip_a_byte, leaves, train, train_here
+from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command_here, flip_a_byte, leaves, train, train_here
 
 from mjx_walk.api import resolve
 from mjx_walk.runs import checkpoint
@@ -20,32 +20,32 @@ from mjx_walk.utils.subprocesses import start_module
 
 
 @pytest.fixture(scope="module")
-def six_chunks(tmp_path_factory):
-    """The leaves after six chunks that nothing interrupted, by the engine."""
+def six_calls(tmp_path_factory):
+    """The leaves after six uninterrupted calls, by engine."""
 
     @functools.cache
     def on(physics):
         run_dir = tmp_path_factory.mktemp("runs") / physics
-        train_here(run_dir, f"physics={physics}", f"total_steps={6 * TINY_CHUNK}")
+        train_here(run_dir, f"physics={physics}", f"total_steps={6 * TINY_CALL}")
         return leaves(run_dir, 6)
 
     return on
 
 
 @pytest.mark.parametrize("physics", ["c", *(pytest.param(name, marks=pytest.mark.slow) for name in ("jax", "warp"))])
-def test_n_and_n_chunks_equal_2n(tmp_path, physics, six_chunks):
-    train_here(tmp_path / "halves", f"physics={physics}", f"total_steps={3 * TINY_CHUNK}")
-    train(tmp_path / "halves", "resume=true", f"total_steps={6 * TINY_CHUNK}", tiny=[])
-    whole, halves = six_chunks(physics), leaves(tmp_path / "halves", 6)
-    assert whole.keys() == halves.keys() and len(whole) > 50
-    for name, leaf in whole.items():
+def test_n_and_n_calls_equal_2n(tmp_path, physics, six_calls):
+    train_here(tmp_path / "halves", f"physics={physics}", f"total_steps={3 * TINY_CALL}")
+    train(tmp_path / "halves", "resume=true", f"total_steps={6 * TINY_CALL}", tiny=[])
+    full, halves = six_calls(physics), leaves(tmp_path / "halves", 6)
+    assert full.keys() == halves.keys() and len(full) > 50
+    for name, leaf in full.items():
         np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
     assert not np.array_equal(
-        whole["params.policy.params.hidden_0.kernel"],
+        full["params.policy.params.hidden_0.kernel"],
         leaves(tmp_path / "halves", 3)["params.policy.params.hidden_0.kernel"],
     )
     rows = [json.loads(line) for line in (tmp_path / "halves" / "metrics.jsonl").read_text().splitlines()]
-    assert [row["env_steps"] for row in rows] == [i * TINY_CHUNK for i in range(1, 7)]
+    assert [row["env_steps"] for row in rows] == [i * TINY_CALL for i in range(1, 7)]
     seconds = [row["wall_seconds"] for row in rows]
     assert seconds == sorted(seconds)
 
@@ -54,16 +54,16 @@ def test_n_and_n_chunks_equal_2n(tmp_path, physics, six_chunks):
 @pytest.mark.parametrize("algo", ["sac", "csac", "td3", "ddpg"])
 def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
     """The first half ends after the replay has gone round, with truncated episodes in it."""
-    train_here(tmp_path / "whole", f"algo={algo}", f"total_steps={9 * TINY_CHUNK}", tiny=TINY_OFF_POLICY)
-    train_here(tmp_path / "halves", f"algo={algo}", f"total_steps={5 * TINY_CHUNK}", tiny=TINY_OFF_POLICY)
-    train(tmp_path / "halves", f"algo={algo}", f"total_steps={9 * TINY_CHUNK}", "resume=true", tiny=TINY_OFF_POLICY)
-    whole, halves = leaves(tmp_path / "whole", 9), leaves(tmp_path / "halves", 9)
-    assert whole.keys() == halves.keys() and whole["replay.rows"] == 72 and whole["replay.cuts"].sum() > 0
-    for name, leaf in whole.items():
+    train_here(tmp_path / "full", f"algo={algo}", f"total_steps={9 * TINY_CALL}", tiny=TINY_OFF_POLICY)
+    train_here(tmp_path / "halves", f"algo={algo}", f"total_steps={5 * TINY_CALL}", tiny=TINY_OFF_POLICY)
+    train(tmp_path / "halves", f"algo={algo}", f"total_steps={9 * TINY_CALL}", "resume=true", tiny=TINY_OFF_POLICY)
+    full, halves = leaves(tmp_path / "full", 9), leaves(tmp_path / "halves", 9)
+    assert full.keys() == halves.keys() and full["replay.rows"] == 72 and full["replay.cuts"].sum() > 0
+    for name, leaf in full.items():
         np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
-    steps = checkpoint.list_steps(tmp_path / "whole" / "checkpoints")
+    steps = checkpoint.list_steps(tmp_path / "full" / "checkpoints")
     assert [(path / "replay").exists() for path in steps] == [False, False, True]
-    assert not (tmp_path / "whole" / "checkpoints" / "best" / "replay").exists()
+    assert not (tmp_path / "full" / "checkpoints" / "best" / "replay").exists()
 
 
 @pytest.mark.slow
@@ -75,42 +75,42 @@ def test_policy_gradient_resume_is_exact(tmp_path, algo):
         "algo.ou_noise_std=0.1" if algo == "a2c" else "algo.discount=0.5",
     ]
     tiny = [setting for setting in TINY if "num_epochs" not in setting]
-    train_here(tmp_path / "whole", *settings, f"total_steps={4 * TINY_CHUNK}", tiny=tiny)
-    train_here(tmp_path / "halves", *settings, f"total_steps={2 * TINY_CHUNK}", tiny=tiny)
-    train(tmp_path / "halves", f"total_steps={4 * TINY_CHUNK}", "resume=true", tiny=[])
-    whole, halves = leaves(tmp_path / "whole", 4), leaves(tmp_path / "halves", 4)
-    assert whole.keys() == halves.keys() and len(whole) > 40 and ("exploration" in whole) == (algo == "a2c")
-    for name, leaf in whole.items():
+    train_here(tmp_path / "full", *settings, f"total_steps={4 * TINY_CALL}", tiny=tiny)
+    train_here(tmp_path / "halves", *settings, f"total_steps={2 * TINY_CALL}", tiny=tiny)
+    train(tmp_path / "halves", f"total_steps={4 * TINY_CALL}", "resume=true", tiny=[])
+    full, halves = leaves(tmp_path / "full", 4), leaves(tmp_path / "halves", 4)
+    assert full.keys() == halves.keys() and len(full) > 40 and ("exploration" in full) == (algo == "a2c")
+    for name, leaf in full.items():
         np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
 
 
 @pytest.mark.slow
 def test_a_replay_that_is_gone_is_filled_again(tmp_path):
-    train_here(tmp_path / "run", "algo=sac", f"total_steps={6 * TINY_CHUNK}", tiny=TINY_OFF_POLICY)
-    flip_a_byte(checkpoint.step_path(tmp_path / "run" / "checkpoints", 6 * TINY_CHUNK))
+    train_here(tmp_path / "run", "algo=sac", f"total_steps={6 * TINY_CALL}", tiny=TINY_OFF_POLICY)
+    flip_a_byte(checkpoint.step_path(tmp_path / "run" / "checkpoints", 6 * TINY_CALL))
     before = leaves(tmp_path / "run", 4)
-    done = train(tmp_path / "run", "algo=sac", f"total_steps={6 * TINY_CHUNK}", "resume=true", tiny=TINY_OFF_POLICY)
+    done = train(tmp_path / "run", "algo=sac", f"total_steps={6 * TINY_CALL}", "resume=true", tiny=TINY_OFF_POLICY)
     assert "has no replay buffer; training refills it" in done.stderr
     after = leaves(tmp_path / "run", 6)
     assert after["replay.rows"] == 16 and after["iterations"] == 48
-    # Two chunks of eight updates, the first seven of which wait for 64 transitions.
+    # Two calls of eight iterations, the first seven of which wait for 64 transitions.
     assert after["critic_updates"] - before["critic_updates"] == 2 * (16 - 7)
 
 
-def test_a_damaged_checkpoint_costs_only_its_own_chunks(tmp_path, six_chunks):
-    train_here(tmp_path / "run", "physics=c", f"total_steps={4 * TINY_CHUNK}")
-    flip_a_byte(checkpoint.step_path(tmp_path / "run" / "checkpoints", 4 * TINY_CHUNK))
-    resumed = train(tmp_path / "run", f"total_steps={6 * TINY_CHUNK}", "resume=true", tiny=[])
+def test_a_damaged_checkpoint_costs_only_its_own_calls(tmp_path, six_calls):
+    train_here(tmp_path / "run", "physics=c", f"total_steps={4 * TINY_CALL}")
+    flip_a_byte(checkpoint.step_path(tmp_path / "run" / "checkpoints", 4 * TINY_CALL))
+    resumed = train(tmp_path / "run", f"total_steps={6 * TINY_CALL}", "resume=true", tiny=[])
     assert "damaged" in resumed.stderr and "falling back" in resumed.stderr
-    whole, run = six_chunks("c"), leaves(tmp_path / "run", 6)
-    for name, leaf in whole.items():
+    full, run = six_calls("c"), leaves(tmp_path / "run", 6)
+    for name, leaf in full.items():
         np.testing.assert_array_equal(leaf, run[name], err_msg=name)
     rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
-    assert [row["env_steps"] for row in rows] == [i * TINY_CHUNK for i in range(1, 7)]
+    assert [row["env_steps"] for row in rows] == [i * TINY_CALL for i in range(1, 7)]
 
 
 @pytest.mark.parametrize("name", ["SIGINT", *(pytest.param(x, marks=pytest.mark.slow) for x in ("SIGTERM", "SIGUSR1"))])
-def test_signals_finish_the_chunk_save_and_say_how_to_go_on(tmp_path, name):
+def test_signals_finish_the_call_save_and_say_how_to_continue(tmp_path, name):
     run_dir = tmp_path / "run"
     arguments = [sys.executable, "-m", "mjx_walk.train", *TINY, f"run_dir={run_dir}", "total_steps=100000000"]
     process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
@@ -130,19 +130,19 @@ def test_signals_finish_the_chunk_save_and_say_how_to_go_on(tmp_path, name):
 
 def test_a_resume_that_fails_changes_nothing(tmp_path):
     run_dir = tmp_path / "run"
-    train_here(run_dir, f"total_steps={2 * TINY_CHUNK}")
-    path = checkpoint.step_path(run_dir / "checkpoints", 2 * TINY_CHUNK)
+    train_here(run_dir, f"total_steps={2 * TINY_CALL}")
+    path = checkpoint.step_path(run_dir / "checkpoints", 2 * TINY_CALL)
     shutil.copytree(path, f"{path}.copy")  # which is no checkpoint of the run
     flip_a_byte(path)
     before = (run_dir / "config.yaml").read_text()
     with pytest.warns(UserWarning, match="damaged"):
-        assert command_here("train", f"run_dir={run_dir}", "resume=true", f"total_steps={9 * TINY_CHUNK}") == 2
+        assert command_here("train", f"run_dir={run_dir}", "resume=true", f"total_steps={9 * TINY_CALL}") == 2
     assert (run_dir / "config.yaml").read_text() == before
 
 
 def test_a_run_that_was_scored_and_has_no_checkpoint_is_not_begun_again(tmp_path, capsys):
     run_dir = tmp_path / "run"
-    train_here(run_dir, f"total_steps={TINY_CHUNK}", "evaluation.gymnasium_episodes=1")
+    train_here(run_dir, f"total_steps={TINY_CALL}", "evaluation.gymnasium_episodes=1")
     shutil.rmtree(run_dir / "checkpoints")
     before = {path.name: path.read_bytes() for path in run_dir.iterdir() if path.is_file()}
     assert command_here("train", f"run_dir={run_dir}", "resume=true") == 2
@@ -152,28 +152,28 @@ def test_a_run_that_was_scored_and_has_no_checkpoint_is_not_begun_again(tmp_path
 
 def test_a_run_that_saved_nothing_begins_again(tmp_path):
     run_dir = tmp_path / "run"
-    train_here(run_dir, f"total_steps={2 * TINY_CHUNK}")
-    whole = leaves(run_dir, 2)
+    train_here(run_dir, f"total_steps={2 * TINY_CALL}")
+    full = leaves(run_dir, 2)
     shutil.rmtree(run_dir / "checkpoints")
     (run_dir / "checkpoints").mkdir()
     with pytest.warns(UserWarning, match="has no checkpoint; training restarts from step 0"):
         train_here(run_dir, "resume=true", tiny=[])
     again = leaves(run_dir, 2)
-    for name, leaf in whole.items():
+    for name, leaf in full.items():
         np.testing.assert_array_equal(leaf, again[name], err_msg=name)
     assert len((run_dir / "metrics.jsonl").read_text().splitlines()) == 2
 
 
-def test_a_longer_schedule_may_be_given_and_its_end_is_told(tmp_path, capsys):
+def test_a_longer_schedule_may_be_given_and_its_end_is_reported(tmp_path, capsys):
     run_dir, linear = tmp_path / "2026_11_23", ("algo.learning_rate_schedule=linear", "algo.schedule_steps=128")
-    train_here(run_dir, f"total_steps={2 * TINY_CHUNK}", *linear)
+    train_here(run_dir, f"total_steps={2 * TINY_CALL}", *linear)
     assert capsys.readouterr().err.count("warning") == 0
     params = "params.policy.params.hidden_0.kernel"
-    for more, is_told, learns in (((), True, False), (("algo.schedule_steps=1000",), False, True)):
+    for more, warns, learns in (((), True, False), (("algo.schedule_steps=1000",), False, True)):
         copy = tmp_path / f"copy_{learns}"
         shutil.copytree(run_dir, copy)
-        train_here(copy, "resume=true", f"total_steps={4 * TINY_CHUNK}", *more, tiny=[])
-        assert ("after algo.schedule_steps=128 the learning rate is zero" in capsys.readouterr().err) == is_told
+        train_here(copy, "resume=true", f"total_steps={4 * TINY_CALL}", *more, tiny=[])
+        assert ("after algo.schedule_steps=128 the learning rate is zero" in capsys.readouterr().err) == warns
         assert np.array_equal(leaves(copy, 2)[params], leaves(copy, 4)[params]) != learns
 
 
@@ -188,26 +188,26 @@ def sigterm(*_):
 @pytest.mark.parametrize(("end", "code", "shown"), [(ctrl_c, 130, "Ctrl-C"), (sigterm, 143, "SIGTERM")])
 def test_a_signal_while_a_policy_is_scored_says_how_to_score_it(tmp_path, monkeypatch, capsys, end, code, shown):
     monkeypatch.setattr("mjx_walk.training.recorder.score_in_gymnasium", end)
-    whole = (*TINY, "evaluation.gymnasium_episodes=2", f"total_steps={TINY_CHUNK}", f"run_dir={tmp_path / 'run'}")
-    assert command_here("train", *whole) == code
+    full = (*TINY, "evaluation.gymnasium_episodes=2", f"total_steps={TINY_CALL}", f"run_dir={tmp_path / 'run'}")
+    assert command_here("train", *full) == code
     said = capsys.readouterr()
     assert f"python -m mjx_walk.eval run={tmp_path / 'run'}" in said.out and f"Stopped by {shown}." in said.err
-    assert [int(path.name) for path in checkpoint.list_steps(tmp_path / "run" / "checkpoints")] == [TINY_CHUNK]
+    assert [int(path.name) for path in checkpoint.list_steps(tmp_path / "run" / "checkpoints")] == [TINY_CALL]
     monkeypatch.undo()
     assert command_here("eval", f"run={tmp_path / 'run'}", "episodes=2") == 0
 
 
 def test_a_save_that_is_cut_short_has_kept_the_best_policy(tmp_path, monkeypatch):
-    whole_save = checkpoint.save
+    complete_save = checkpoint.save
 
     def save(path, *arguments):
         if path.name.isdigit():
             raise OSError("No space left on device")
-        whole_save(path, *arguments)
+        complete_save(path, *arguments)
 
     monkeypatch.setattr(checkpoint, "save", save)
     with pytest.raises(OSError, match="No space left"):
-        train_here(tmp_path / "run", f"total_steps={TINY_CHUNK}")
+        train_here(tmp_path / "run", f"total_steps={TINY_CALL}")
     monkeypatch.undo()
     assert command_here("eval", f"run={tmp_path / 'run'}", "episodes=1") == 0
 

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers import TINY, TINY_CHUNK, TINY_OFF_POLICY, leaves, train, train_here
+from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, leaves, train, train_here
 
 from mjx_walk import train as train_command
 from mjx_walk.runs.config import load_config, save_config
@@ -23,7 +23,7 @@ def assert_alike(run, other, exactly):
 
 
 def moved(run_dir):
-    """How the parameters of the policy moved in the second chunk, in one vector."""
+    """Change of the policy's parameters in the second call, as one vector."""
     before, after = leaves(run_dir, 1), leaves(run_dir, 2)
     names = [name for name in after if ".policy.params." in name and "optimizer" not in name]
     assert len(names) >= 4
@@ -34,7 +34,7 @@ def moved(run_dir):
     ("algo", "tiny"), [("ppo", TINY), pytest.param("sac", TINY_OFF_POLICY, marks=pytest.mark.slow)]
 )
 def test_seeds_side_by_side_are_the_runs_of_each(tmp_path, algo, tiny):
-    settings = [f"algo={algo}", f"total_steps={2 * TINY_CHUNK}", "checkpoint.every_calls=1"]
+    settings = [f"algo={algo}", f"total_steps={2 * TINY_CALL}", "checkpoint.every_calls=1"]
     tiny = [setting for setting in tiny if "every_calls" not in setting]
     train_here(tmp_path / "both", *settings, SEEDS, tiny=tiny)
     train_here(tmp_path / "alone", *settings, "seed=5", tiny=tiny)
@@ -53,21 +53,21 @@ def test_seeds_side_by_side_are_the_runs_of_each(tmp_path, algo, tiny):
 
 @pytest.mark.slow
 def test_seeds_side_by_side_resume_exactly_and_each_may_go_on_alone(tmp_path):
-    train_here(tmp_path / "whole", f"total_steps={4 * TINY_CHUNK}", SEEDS)
-    train_here(tmp_path / "halves", f"total_steps={2 * TINY_CHUNK}", SEEDS)
-    further = (f"total_steps={4 * TINY_CHUNK}", "resume=true")
+    train_here(tmp_path / "full", f"total_steps={4 * TINY_CALL}", SEEDS)
+    train_here(tmp_path / "halves", f"total_steps={2 * TINY_CALL}", SEEDS)
+    further = (f"total_steps={4 * TINY_CALL}", "resume=true")
     train(tmp_path / "halves", *further, SEEDS, tiny=[])
     for seed in (3, 5):
-        whole, halves = (leaves(tmp_path / name / f"seed_{seed}", 4) for name in ("whole", "halves"))
-        assert_alike(whole, halves, exactly=True)
-    train_here(tmp_path / "one", f"total_steps={2 * TINY_CHUNK}", SEEDS)
+        full, halves = (leaves(tmp_path / name / f"seed_{seed}", 4) for name in ("full", "halves"))
+        assert_alike(full, halves, exactly=True)
+    train_here(tmp_path / "one", f"total_steps={2 * TINY_CALL}", SEEDS)
     train(tmp_path / "one" / "seed_5", *further, tiny=[])
-    assert_alike(leaves(tmp_path / "whole" / "seed_5", 4), leaves(tmp_path / "one" / "seed_5", 4), exactly=False)
+    assert_alike(leaves(tmp_path / "full" / "seed_5", 4), leaves(tmp_path / "one" / "seed_5", 4), exactly=False)
     with pytest.raises(AssertionError, match=r"differ in total_steps \(was 128, now 256\); resume each alone"):
         train(tmp_path / "one", "resume=true", SEEDS, tiny=[])
     before = (tmp_path / "one" / "seed_3" / "config.yaml").read_text()
     with pytest.raises(AssertionError, match=r"error: the seeds are at different steps \(128, 256\); resume"):
-        train(tmp_path / "one", f"total_steps={6 * TINY_CHUNK}", "resume=true", SEEDS, tiny=[])
+        train(tmp_path / "one", f"total_steps={6 * TINY_CALL}", "resume=true", SEEDS, tiny=[])
     assert (tmp_path / "one" / "seed_3" / "config.yaml").read_text() == before
 
 

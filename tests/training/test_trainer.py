@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TINY, TINY_CHUNK
+from helpers import TINY, TINY_CALL
 
 import mjx_walk
 from mjx_walk import train as train_command
@@ -19,7 +19,7 @@ from mjx_walk.utils.errors import UserError
 def test_the_same_seed_gives_the_same_run_and_another_does_not(tmp_path):
     losses = []
     for i, seed in enumerate((1, 1, 2)):
-        run = [*TINY, f"run_dir={tmp_path}/{i}", f"total_steps={3 * TINY_CHUNK}", f"seed={seed}"]
+        run = [*TINY, f"run_dir={tmp_path}/{i}", f"total_steps={3 * TINY_CALL}", f"seed={seed}"]
         losses.append([row["train/loss"] for row in mjx_walk.run(run).metrics[1:]])
     assert losses[0] == losses[1] != losses[2]
 
@@ -37,18 +37,18 @@ def test_nothing_is_compiled_twice():
 
     task.step = counted
     algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo)
-    chunk = make_step(algorithm.collect, algorithm.learn, 2, fused=True)
+    call = make_step(algorithm.collect, algorithm.learn, 2, fused=True)
     state = make_init(algorithm.init)(jax.random.PRNGKey(0))
-    state, _ = chunk(state)
+    state, _ = call(state)
     after_first = traces
     for _ in range(3):
-        state, metrics = chunk(state)
+        state, metrics = call(state)
     assert traces == after_first and metrics["loss"].value.shape == (2,)
-    assert chunk._cache_size() == 1
+    assert call._cache_size() == 1
 
 
-def test_a_chunk_is_told_before_the_next_begins(tmp_path, monkeypatch):
-    """So that a row's seconds, and the speed beside them, are those of its own chunk."""
+def test_a_call_is_logged_before_the_next_begins(tmp_path, monkeypatch):
+    """A row's seconds and speed are those of its own call."""
     events = []
 
     def counted(*args, **kwargs):
@@ -61,9 +61,9 @@ def test_a_chunk_is_told_before_the_next_begins(tmp_path, monkeypatch):
         return begin
 
     monkeypatch.setattr(programs, "make_step", counted)
-    overrides = [*TINY, f"run_dir={tmp_path / 'run'}", f"total_steps={3 * TINY_CHUNK}"]
-    mjx_walk.run(overrides, on_metrics=lambda row: events.append("is told"))
-    assert events == 3 * ["begins", "is told"]
+    overrides = [*TINY, f"run_dir={tmp_path / 'run'}", f"total_steps={3 * TINY_CALL}"]
+    mjx_walk.run(overrides, on_metrics=lambda row: events.append("is logged"))
+    assert events == 3 * ["begins", "is logged"]
 
 
 def test_a_reward_that_is_not_finite_warns_once(tmp_path, monkeypatch, caplog):
@@ -71,24 +71,24 @@ def test_a_reward_that_is_not_finite_warns_once(tmp_path, monkeypatch, caplog):
     (tmp_path / "mine.py").write_text(
         "import jax.numpy as jnp\ndef root(step):\n    return {'reward_root': jnp.sqrt(-1 - step.after.qpos[0] ** 2)}\n"
     )
-    train_command.main([*TINY, f"total_steps={2 * TINY_CHUNK}", "env.reward_function=mine.py:root"])
+    train_command.main([*TINY, f"total_steps={2 * TINY_CALL}", "env.reward_function=mine.py:root"])
     warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(warned) == 1 and "64 of 64 steps ended their episodes without a reward" in warned[0]
 
 
 def test_training_that_diverges_stops_and_keeps_what_was_saved_before(tmp_path):
-    run, steps = tmp_path / "run", f"total_steps={50 * TINY_CHUNK}"
+    run, steps = tmp_path / "run", f"total_steps={50 * TINY_CALL}"
     arguments = [*TINY, f"run_dir={run}", "checkpoint.every_calls=1", steps]
     with pytest.raises(UserError, match=r"training has diverged: .* the policy of seed 0 is not finite"):
         train_command.main([*arguments, "algo.learning_rate=1e30"])
     assert 1 <= len((run / "metrics.jsonl").read_text().splitlines()) <= 3
-    # Nothing is learned from the first batch: what was saved after it is sound. What came of the second is not.
-    assert sorted(path.name for path in (run / "checkpoints").iterdir()) == [f"{TINY_CHUNK:013d}", "best"]
+    # PPO learns nothing from the first batch, so the checkpoint after it is finite. The second batch diverges.
+    assert sorted(path.name for path in (run / "checkpoints").iterdir()) == [f"{TINY_CALL:013d}", "best"]
     policy_params = mjx_walk.load_run(run).policy_params
     assert all(np.isfinite(np.asarray(leaf, np.float64)).all() for leaf in jax.tree.leaves(policy_params))
 
 
-def test_of_seeds_side_by_side_those_that_are_sound_are_saved(tmp_path, monkeypatch):
+def test_only_seeds_with_a_finite_policy_are_saved(tmp_path, monkeypatch):
     """The second one's policy is broken from the start."""
 
     def broken(init):
@@ -103,6 +103,6 @@ def test_of_seeds_side_by_side_those_that_are_sound_are_saved(tmp_path, monkeypa
 
     monkeypatch.setattr(programs, "make_init", broken)
     with pytest.raises(UserError, match="the policy of seed 5 is not finite"):
-        train_command.main([*TINY, f"run_dir={tmp_path}", "seeds=[3,5]", f"total_steps={50 * TINY_CHUNK}"])
+        train_command.main([*TINY, f"run_dir={tmp_path}", "seeds=[3,5]", f"total_steps={50 * TINY_CALL}"])
     assert len(list((tmp_path / "seed_3" / "checkpoints").glob("0*"))) == 1
     assert not list((tmp_path / "seed_5" / "checkpoints").iterdir())

@@ -5,7 +5,7 @@ import sys
 import warnings
 
 import pytest
-from helpers import TINY, TINY_CHUNK, command_here
+from helpers import TINY, TINY_CALL, command_here
 
 import mjx_walk
 from mjx_walk.utils import cli
@@ -30,15 +30,15 @@ def test_commands_print_messages_without_prefix_and_warnings_in_one_line(capsys,
 
 
 def test_from_python_a_run_is_quiet_and_logs(tmp_path, capfd, caplog):
-    mjx_walk.run([*TINY, f"run_dir={tmp_path}/quiet", f"total_steps={TINY_CHUNK}"])
+    mjx_walk.run([*TINY, f"run_dir={tmp_path}/quiet", f"total_steps={TINY_CALL}"])
     printed = capfd.readouterr()
     assert "Training" not in printed.out and "steps" not in printed.err
     with caplog.at_level(logging.INFO, logger="mjx_walk"):
-        mjx_walk.run([*TINY, f"run_dir={tmp_path}/logged", f"total_steps={TINY_CHUNK}"])
+        mjx_walk.run([*TINY, f"run_dir={tmp_path}/logged", f"total_steps={TINY_CALL}"])
     assert "Training walker2d with ppo on the CPU, physics=c" in caplog.text and "64 steps" in caplog.text
 
 
 def test_a_training_command_shows_messages_and_progress(tmp_path, capfd):
-    assert command_here("train", *TINY, f"run_dir={tmp_path}/run", f"total_steps={TINY_CHUNK}") == 0
+    assert command_here("train", *TINY, f"run_dir={tmp_path}/run", f"total_steps={TINY_CALL}") == 0
     printed = capfd.readouterr()
     assert "Training walker2d with ppo on the CPU" in printed.out and "64 steps" in printed.err

@@ -7,7 +7,7 @@ import warnings
 
 import jax
 import pytest
-from helpers import ENVIRONMENT, TINY, TINY_CHUNK
+from helpers import ENVIRONMENT, TINY, TINY_CALL
 
 import mjx_walk
 from mjx_walk.utils.compat import temporary_jax_settings
@@ -30,7 +30,7 @@ def test_a_run_leaves_the_settings_of_its_caller(chosen, tmp_path, monkeypatch):
         with jax.default_matmul_precision("bfloat16"), temporary_jax_settings("float32"):
             assert jax.config.jax_default_matmul_precision == "float32"
             assert jax.config.jax_compilation_cache_dir == (own or str(tmp_path / "user" / "mjx_walk" / "jax"))
-        mjx_walk.run([*TINY, f"run_dir={tmp_path}/run", f"total_steps={TINY_CHUNK}"])
+        mjx_walk.run([*TINY, f"run_dir={tmp_path}/run", f"total_steps={TINY_CALL}"])
         assert settings_of_process() == before
     finally:
         jax.config.update("jax_compilation_cache_dir", former)

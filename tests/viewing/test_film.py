@@ -1,11 +1,11 @@
-"""Films beside training."""
+"""Films during training."""
 
 import struct
 
 import imageio.v3 as iio
 import imageio_ffmpeg
 import pytest
-from helpers import TINY, TINY_CHUNK, command, renders
+from helpers import TINY, TINY_CALL, command, renders
 from tensorboardX.proto.event_pb2 import Event
 
 from mjx_walk import api
@@ -30,9 +30,9 @@ def films_in_tensorboard(run_dir):
 @renders
 @pytest.mark.slow
 def test_evaluations_are_filmed(tmp_path):
-    chunks = 30
+    calls = 30
     done = command(
-        "train", *TINY, f"run_dir={tmp_path}/run", f"total_steps={chunks * TINY_CHUNK}", "evaluation.films=true"
+        "train", *TINY, f"run_dir={tmp_path}/run", f"total_steps={calls * TINY_CALL}", "evaluation.films=true"
     )
     assert done.returncode == 0, done.stderr
     films = sorted((tmp_path / "run" / "films").iterdir())
