@@ -87,7 +87,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         is_over = last.terminated | last.truncated
         info: dict[str, Any] = dict(last.metrics)
         if is_over.any():
-            # Layout of Gymnasium's own vector environments: one object per environment, None while its episode continues.
+            # Gymnasium's own vector environments have this layout: one object per environment, None while it runs.
             final_obs = np.full(self.num_envs, None, dtype=object)
             for i in np.flatnonzero(is_over):
                 final_obs[i] = last.obs[i]
