@@ -5,6 +5,7 @@ import re
 import runpy
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import orbax.checkpoint as ocp
@@ -64,6 +65,48 @@ def command(module: str, *arguments: str, **kwargs) -> subprocess.CompletedProce
     )
 
 
+def start(module: str, *arguments: str, **kwargs) -> subprocess.Popen:
+    """The same, left running. Its two outputs are one stream. It is killed after five minutes."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", f"mjx_walk.{module}", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=ENVIRONMENT,
+        **kwargs,
+    )
+    limit = threading.Timer(300, process.kill)
+    limit.daemon = True
+    limit.start()
+    return process
+
+
+def wait_for_line(process: subprocess.Popen, text: str) -> None:
+    """Block until a started command prints a line that contains a text."""
+    printed = []
+    for line in process.stdout:
+        printed.append(line)
+        if text in line:
+            return
+    raise AssertionError(f"ended before '{text}':\n{''.join(printed)}")
+
+
+def wait_for_rows(process: subprocess.Popen, run_dir: Path, count: int) -> None:
+    """Block until a started command has logged that many calls to a run folder that it creates."""
+    follow = ["tail", f"--pid={process.pid}", "--lines=+1", "--follow=name", "--retry", str(run_dir / "metrics.jsonl")]
+    with subprocess.Popen(follow, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as tail:
+        rows = [tail.stdout.readline() for _ in range(count)]
+        tail.kill()
+    assert all(rows), finish(process)
+
+
+def finish(process: subprocess.Popen) -> str:
+    """Wait for a started command to end; what else it prints."""
+    rest = process.stdout.read()
+    process.wait()
+    return rest
+
+
 def command_here(module: str, *arguments: str) -> int:
     """The same in this process, whose imports and programs are there already; the exit code."""
     with pytest.MonkeyPatch.context() as patched:
@@ -82,7 +125,10 @@ def leaves(run_dir, call):
 
 
 def train_here(run_dir, *arguments, tiny=TINY):
-    assert command_here("train", *tiny, f"run_dir={run_dir}", *arguments) == 0
+    """Train in this process. Curves are not drawn, which would take a quarter of the time."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("mjx_walk.viewing.curves.plot_run", lambda folder: None)
+        assert command_here("train", *tiny, f"run_dir={run_dir}", *arguments) == 0
 
 
 def train(run_dir, *arguments, tiny=TINY):

@@ -1,5 +1,6 @@
 """`devices=N`: start one process for each GPU of this host. They train one run together."""
 
+import logging
 import os
 import signal
 import socket
@@ -12,6 +13,8 @@ from pathlib import Path
 from mjx_walk.utils.devices import count_devices, only_device
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.signals import Interrupt, exit_code
+
+_log = logging.getLogger(__name__)
 
 _PATIENCE = 20.0
 """Seconds that the other processes have to exit after one has failed."""
@@ -41,11 +44,11 @@ def run(arguments: list[str], size: int) -> int:
     """
     with tempfile.TemporaryDirectory() as logs, Interrupt("all devices finish this call, then save") as interrupt:
         processes = _start(arguments, size, Path(logs))
-        has_told = False
+        is_forwarded = False
         bad: list[int] = []
         while any(process.poll() is None for process in processes) and not bad:
-            if interrupt.signal_name and not has_told:
-                has_told = True
+            if interrupt.signal_name and not is_forwarded:
+                is_forwarded = True
                 for process in processes:
                     process.send_signal(signal.Signals[interrupt.signal_name])
             time.sleep(0.2)
@@ -58,12 +61,12 @@ def run(arguments: list[str], size: int) -> int:
         if interrupt.signal_name:
             return exit_code(interrupt.signal_name)
         if rank:
-            print(_log(Path(logs), rank).read_text(errors="replace")[-2000:], file=sys.stderr)
+            output = _log_file(Path(logs), rank).read_text(errors="replace")
+            _log.error(f"the output of device {rank} ends with:\n{output[-2000:]}")
         if code != 2:  # with code 2 the process has printed its own error
-            print(
-                f"error: the process of device {rank} failed with exit code {code}; "
-                "the last saved checkpoint is complete; add resume=true to resume from it",
-                file=sys.stderr,
+            _log.error(
+                f"the process of device {rank} failed with exit code {code}; "
+                "the last saved checkpoint is complete; add resume=true to resume from it"
             )
         return 2 if code == 2 else 1
 
@@ -75,7 +78,7 @@ def _start(arguments: list[str], size: int, logs: Path) -> list[subprocess.Popen
     processes = []
     for rank in range(size):
         env = os.environ | {"MJX_WALK_PROCESS": f"{rank},{size},{coordinator}"} | only_device(rank)
-        with _log(logs, rank).open("w") as log:
+        with _log_file(logs, rank).open("w") as log:
             output = log if rank else None
             processes.append(
                 subprocess.Popen(
@@ -89,7 +92,7 @@ def _start(arguments: list[str], size: int, logs: Path) -> list[subprocess.Popen
     return processes
 
 
-def _log(logs: Path, rank: int) -> Path:
+def _log_file(logs: Path, rank: int) -> Path:
     return logs / f"{rank}.txt"
 
 

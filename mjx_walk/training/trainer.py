@@ -134,7 +134,7 @@ class Trainer:
                 scores = recorder.score(seconds)
                 which = f"seed {recorder.config.seed}: " if len(self.recorders) > 1 else ""
                 if scores:
-                    print(f"{which}In the real Gymnasium, {scores}", flush=True)
+                    _log.info(f"{which}In the real Gymnasium, {scores}")
         finally:
             for recorder in self.recorders:
                 recorder.wait()

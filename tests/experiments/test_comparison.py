@@ -4,12 +4,10 @@ import csv
 import json
 import signal
 import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
-from helpers import ENVIRONMENT, command, command_here
+from helpers import command, command_here, finish, start, wait_for_rows
 
 from mjx_walk import compare as compare_command
 from mjx_walk.experiments import planned_runs, report
@@ -152,17 +150,11 @@ def test_compare_runs_what_is_missing_and_keeps_the_rest(tmp_path, monkeypatch, 
 def test_an_interrupted_comparison_goes_on(tmp_path):
     arguments = ["algos=[a2c]", "seeds=1", "out=out", *SMALL, "checkpoint.every_calls=1"]
     arguments[arguments.index("total_steps=512")] = "total_steps=6400"
-    full = [sys.executable, "-m", "mjx_walk.compare", *arguments]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    process = subprocess.Popen(full, cwd=tmp_path, env=ENVIRONMENT, **pipes)
+    process = start("compare", *arguments, cwd=tmp_path)
     run = tmp_path / "out" / "a2c" / "seed_0"
-    deadline = time.monotonic() + 120
-    while not list(run.glob("checkpoints/0*")):
-        assert time.monotonic() < deadline and process.poll() is None
-        time.sleep(0.2)
+    wait_for_rows(process, run, 2)
     process.send_signal(signal.SIGINT)
-    out, _ = process.communicate(timeout=60)
-    assert process.returncode == 130 and "Run the same command to resume" in out
+    assert "Run the same command to resume" in finish(process) and process.returncode == 130
     steps = len((run / "metrics.jsonl").read_text().splitlines())
     assert 0 < steps < 100
     done = command("compare", *arguments, cwd=tmp_path)

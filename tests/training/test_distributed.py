@@ -3,14 +3,12 @@
 import os
 import signal
 import subprocess
-import sys
-import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENVIRONMENT, TINY, TINY_CALL, TINY_OFF_POLICY, command
+from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command, finish, start, wait_for_line, wait_for_rows
 from toy_tasks import ObservedReward
 
 from mjx_walk.algos import make_algorithm
@@ -176,60 +174,38 @@ def test_two_processes_learn_the_same_and_resume_exactly(tmp_path, tiny):
         run(tmp_path / "parted", f"total_steps={(4 + 2 * devices) * CALL}", "resume=true", tiny=tiny, devices=devices)
 
 
-def start(*arguments):
-    """Training, to be disturbed."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "mjx_walk.train", *TINY, *arguments],
-        env=ENVIRONMENT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def wait_until(is_so):
-    deadline = time.monotonic() + 300
-    while not is_so():
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-
-
 @pytest.mark.slow
 def test_a_process_that_fails_ends_the_run_which_resumes_from_its_checkpoint(tmp_path):
-    settings = [f"run_dir={tmp_path}/run", "devices=2"]
-    parent = start(*settings, "checkpoint.every_calls=1", f"total_steps={60 * CALL}")
-    second = tmp_path / "run" / "checkpoints" / "device_1"
-    wait_until(lambda: len(list(second.glob("0*"))) >= 2)
+    settings = [*TINY, f"run_dir={tmp_path}/run", "devices=2"]
+    parent = start("train", *settings, "checkpoint.every_calls=1", f"total_steps={60 * CALL}")
+    wait_for_rows(parent, tmp_path / "run", 3)
     children = subprocess.run(["pgrep", "-P", str(parent.pid)], capture_output=True, text=True, check=True)
     os.kill(int(children.stdout.split()[-1]), signal.SIGKILL)
-    _, errors = parent.communicate(timeout=120)
-    assert parent.returncode == 1 and "the process of device 1 failed with exit code" in errors
+    assert "the process of device 1 failed with exit code" in finish(parent) and parent.returncode == 1
     assert not (tmp_path / "run" / "eval_gymnasium.json").exists()
-    done = command("train", *settings, "resume=true")
+    done = command("train", f"run_dir={tmp_path}/run", "devices=2", "resume=true")
     assert done.returncode == 0, done.stderr
     assert read_rows(tmp_path / "run" / "metrics.jsonl")[-1]["env_steps"] == 60 * CALL
 
 
 @pytest.mark.slow
 def test_a_signal_stops_all_devices_at_the_same_step(tmp_path):
-    parent = start(f"run_dir={tmp_path}/run", "devices=2", "total_steps=100000000")
-    wait_until(lambda: list(tmp_path.glob("run/checkpoints/0*")))
+    parent = start("train", *TINY, f"run_dir={tmp_path}/run", "devices=2", "total_steps=100000000")
+    wait_for_rows(parent, tmp_path / "run", 1)
     parent.send_signal(signal.SIGTERM)
-    out, _ = parent.communicate(timeout=120)
-    assert parent.returncode == 128 + signal.SIGTERM and "Stopped by SIGTERM and saved" in out
+    assert "Stopped by SIGTERM and saved" in finish(parent) and parent.returncode == 128 + signal.SIGTERM
     checkpoints = tmp_path / "run" / "checkpoints"
     first, second = (checkpoint.list_steps(folder)[-1] for folder in (checkpoints, checkpoints / "device_1"))
     assert first.name == second.name
 
 
 @pytest.mark.slow
-def test_ctrl_c_while_a_team_is_scored_says_how_to_score_it(tmp_path):
+def test_ctrl_c_while_several_devices_are_scored_says_how_to_score(tmp_path):
     long = ["evaluation.gymnasium_episodes=200", "env.terminate_when_unhealthy=false"]  # a minute or so
-    parent = start(f"run_dir={tmp_path}/run", "devices=2", *long, "total_steps=1")
-    wait_until((tmp_path / "run" / "reward_terms.png").exists)
-    time.sleep(3)  # the plot is drawn just before scoring begins
+    parent = start("train", *TINY, f"run_dir={tmp_path}/run", "devices=2", *long, "total_steps=1")
+    wait_for_line(parent, "Scoring 200 episodes")
     parent.send_signal(signal.SIGINT)
-    out, errors = parent.communicate(timeout=120)
-    assert parent.returncode == 128 + signal.SIGINT and "Traceback" not in out + errors
-    assert f"To score: python -m mjx_walk.eval run={tmp_path}/run" in out
+    printed = finish(parent)
+    assert parent.returncode == 128 + signal.SIGINT and "Traceback" not in printed
+    assert f"To score: python -m mjx_walk.eval run={tmp_path}/run" in printed
     assert checkpoint.list_steps(tmp_path / "run" / "checkpoints")

@@ -2,17 +2,26 @@
 
 import functools
 import json
-import os
 import pickle
 import shutil
 import signal
 import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
-from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command_here, flip_a_byte, leaves, train, train_here
+from helpers import (
+    TINY,
+    TINY_CALL,
+    TINY_OFF_POLICY,
+    command_here,
+    finish,
+    flip_a_byte,
+    leaves,
+    start,
+    train,
+    train_here,
+    wait_for_rows,
+)
 
 from mjx_walk.api import resolve
 from mjx_walk.runs import checkpoint
@@ -112,16 +121,12 @@ def test_a_damaged_checkpoint_costs_only_its_own_calls(tmp_path, six_calls):
 @pytest.mark.parametrize("name", ["SIGINT", *(pytest.param(x, marks=pytest.mark.slow) for x in ("SIGTERM", "SIGUSR1"))])
 def test_signals_finish_the_call_save_and_say_how_to_continue(tmp_path, name):
     run_dir = tmp_path / "run"
-    arguments = [sys.executable, "-m", "mjx_walk.train", *TINY, f"run_dir={run_dir}", "total_steps=100000000"]
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
-    deadline = time.monotonic() + 120
-    while not (run_dir / "metrics.jsonl").exists() or not (run_dir / "metrics.jsonl").read_text():
-        assert time.monotonic() < deadline and process.poll() is None, process.communicate()
-        time.sleep(0.2)
+    process = start("train", *TINY, f"run_dir={run_dir}", "total_steps=100000000")
+    wait_for_rows(process, run_dir, 1)
     process.send_signal(getattr(signal, name))
-    out, err = process.communicate(timeout=60)
+    out = finish(process)
     assert process.returncode == 128 + getattr(signal, name).value
-    assert f"To continue: python -m mjx_walk.train run_dir={run_dir} resume=true" in out and "Traceback" not in err
+    assert f"To continue: python -m mjx_walk.train run_dir={run_dir} resume=true" in out and "Traceback" not in out
     last = json.loads((run_dir / "metrics.jsonl").read_text().splitlines()[-1])["env_steps"]
     newest = checkpoint.list_steps(run_dir / "checkpoints")[-1]
     assert int(newest.name) == last
