@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["AnyBut", "has_effect", "refuse_ineffective", "setting", "validate"]
+__all__ = ["AnyBut", "describe", "has_effect", "refuse_ineffective", "setting", "validate"]
 
 
 class AnyBut(NamedTuple):
@@ -139,5 +139,40 @@ def _blockers(owner: Any, name: str) -> list[str] | None:
     return found
 
 
+def describe(schema: type, prefix: str = "") -> list[str]:
+    """A line for each setting of a dataclass: `key=default`, its valid range, and where it has an effect.
+
+    Args:
+        schema: dataclass whose fields have defaults.
+        prefix: start of the full keys, such as `algo.`.
+    """
+    lines = []
+    for field in dataclasses.fields(schema):
+        notes = [_range(field.metadata), _condition(field.metadata.get("only_if"), prefix)]
+        text = f"{prefix}{field.name}={_as_yaml(field.default)}"
+        lines.append(f"{text:<48} {'; '.join(note for note in notes if note)}".rstrip())
+    return lines
+
+
+def _range(limits: Any) -> str:
+    words = {"above": "above", "at_least": "at least", "at_most": "at most", "below": "below"}
+    bounds = " and ".join(f"{word} {limits[name]}" for name, word in words.items() if name in limits)
+    return bounds or "|".join(limits.get("choices", ()))
+
+
+def _condition(only_if: dict[str, Any] | None, prefix: str) -> str:
+    if only_if is None:
+        return ""
+    alternatives = [
+        f"{prefix}{other} other than {_as_yaml(wanted.value)}"
+        if isinstance(wanted, AnyBut)
+        else f"{prefix}{other}={_as_yaml(wanted)}"
+        for other, wanted in only_if.items()
+    ]
+    return f"only with {' or '.join(alternatives)}" if alternatives else "has no effect"
+
+
 def _as_yaml(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(_as_yaml, value))}]"
     return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))
