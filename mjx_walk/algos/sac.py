@@ -96,8 +96,7 @@ class SAC(OffPolicyAlgorithm):
     def losses(self, batch: Batch) -> SACLosses:
         """Brax's losses, with the target entropy of the moment."""
         first, last = self.config.target_entropy, self.config.final_target_entropy
-        last = first if last is None else last
-        target_entropy = last + (first - last) * batch.remaining
+        target_entropy = jnp.float32(first) if last is None else last + (first - last) * batch.remaining
         return make_sac_losses(self.nets, batch.reward_scale, target_entropy, self.task.action_size)
 
     def critic_loss(self, critic: Any, learner: SACState, batch: Batch, key: jax.Array) -> jax.Array:

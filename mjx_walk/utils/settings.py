@@ -142,13 +142,18 @@ def _blockers(owner: Any, name: str) -> list[str] | None:
 def describe(schema: type, prefix: str = "") -> list[str]:
     """A line for each setting of a dataclass: `key=default`, its valid range, and where it has an effect.
 
+    Settings that never have an effect are left out.
+
     Args:
         schema: dataclass whose fields have defaults.
         prefix: start of the full keys, such as `algo.`.
     """
     lines = []
     for field in dataclasses.fields(schema):
-        notes = [_range(field.metadata), _condition(field.metadata.get("only_if"), prefix)]
+        conditions = field.metadata.get("only_if")
+        if conditions == {}:
+            continue
+        notes = [_range(field.metadata), _as_text(conditions) if conditions else ""]
         text = f"{prefix}{field.name}={_as_yaml(field.default)}"
         lines.append(f"{text:<48} {'; '.join(note for note in notes if note)}".rstrip())
     return lines
@@ -160,16 +165,12 @@ def _range(limits: Any) -> str:
     return bounds or "|".join(limits.get("choices", ()))
 
 
-def _condition(only_if: dict[str, Any] | None, prefix: str) -> str:
-    if only_if is None:
-        return ""
+def _as_text(conditions: dict[str, Any]) -> str:
     alternatives = [
-        f"{prefix}{other} other than {_as_yaml(wanted.value)}"
-        if isinstance(wanted, AnyBut)
-        else f"{prefix}{other}={_as_yaml(wanted)}"
-        for other, wanted in only_if.items()
+        f"{other} other than {_as_yaml(wanted.value)}" if isinstance(wanted, AnyBut) else f"{other}={_as_yaml(wanted)}"
+        for other, wanted in conditions.items()
     ]
-    return f"only with {' or '.join(alternatives)}" if alternatives else "has no effect"
+    return f"only with {' or '.join(alternatives)}"
 
 
 def _as_yaml(value: Any) -> str:
