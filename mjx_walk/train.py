@@ -42,7 +42,7 @@ usage: python -m mjx_walk.train [env=humanoid|humanoid_standup|walker2d] [algo=p
   algo.KEY=VALUE                          set an algorithm's setting
   -m seed=0,1,2                           run a Hydra sweep; Hydra's launchers work
   --cfg job                               print the configuration and exit
-  algo=NAME --help                        also list the algorithm's settings: default, valid range, condition
+  algo=NAME --help                        also list the settings of the algorithm, with ranges and conditions
 """
 
 
@@ -89,7 +89,7 @@ def _help(arguments: list[str]) -> str:
     if given[-1] not in ALGORITHMS:
         raise UserError(f"unknown algo '{given[-1]}'; choose one of: {', '.join(ALGORITHMS)}")
     lines = describe(ALGORITHMS[given[-1]][1], "algo.")
-    title = f"Settings of {given[-1]}, with the defaults that recipes may change. A setting without effect is refused."
+    title = f"Settings of {given[-1]}, with their defaults. Recipes change some of them. A given setting without effect is refused."
     return "\n".join([USAGE.strip(), "", title, "", *(f"  {line}" for line in lines if "algo.name=" not in line)])
 
 

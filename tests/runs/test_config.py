@@ -224,7 +224,9 @@ def test_a_given_setting_without_effect_names_what_disables_it(overrides, reason
 
 def test_settings_that_have_an_effect_are_not_refused():
     load_config(["algo=csac", "algo.normalize_rewards=false", "algo.normalized_return_max=3"])
-    load_config(["algo=sac", "algo.learning_rate_schedule=constant", "algo.final_discount=0.9", "algo.schedule_steps=9"])
+    load_config(
+        ["algo=sac", "algo.learning_rate_schedule=constant", "algo.final_discount=0.9", "algo.schedule_steps=9"]
+    )
     load_config(["algo=ppo", "algo.distribution=normal", "algo.init_noise_std=0.1"])
 
 
