@@ -89,8 +89,9 @@ def _help(arguments: list[str]) -> str:
     if given[-1] not in ALGORITHMS:
         raise UserError(f"unknown algo '{given[-1]}'; choose one of: {', '.join(ALGORITHMS)}")
     lines = describe(ALGORITHMS[given[-1]][1], "algo.")
-    title = f"Settings of {given[-1]}, with their defaults. Recipes change some of them. A given setting without effect is refused."
-    return "\n".join([USAGE.strip(), "", title, "", *(f"  {line}" for line in lines if "algo.name=" not in line)])
+    title = f"Settings of {given[-1]}, with their defaults. Recipes change some of them."
+    note = "A setting that you give and that has no effect is refused."
+    return "\n".join([USAGE.strip(), "", title, note, "", *(f"  {line}" for line in lines if "algo.name=" not in line)])
 
 
 def _train_in_process(overrides: list[str], processes: Processes) -> int:
