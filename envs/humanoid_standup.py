@@ -18,7 +18,7 @@ class HumanoidStandupOptions(HumanoidBodyOptions):
     """Keyword arguments of Gymnasium's `HumanoidStandupEnv`. v4 takes none of them."""
 
     name: str = setting("humanoid_standup", choices=("humanoid_standup",))
-    uph_cost_weight: float = 1.0
+    uph_cost_weight: float = setting(1.0, only_if={})
     """Has no effect, as in Gymnasium."""
     ctrl_cost_weight: float = 0.1
     impact_cost_weight: float = 0.5e-6

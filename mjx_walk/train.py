@@ -12,6 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, open_dict
 
+from mjx_walk.algos import ALGORITHMS
 from mjx_walk.api import resolve, resolve_seeds, train
 from mjx_walk.runs.config import (
     CONFIG_DIR,
@@ -27,7 +28,7 @@ from mjx_walk.training import launcher
 from mjx_walk.training.distributed import Processes, join_processes
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import refuse_ineffective
+from mjx_walk.utils.settings import describe, refuse_ineffective
 from mjx_walk.utils.signals import Stopped, exit_code
 
 USAGE = """
@@ -41,6 +42,7 @@ usage: python -m mjx_walk.train [env=humanoid|humanoid_standup|walker2d] [algo=p
   algo.KEY=VALUE                          set an algorithm's setting
   -m seed=0,1,2                           run a Hydra sweep; Hydra's launchers work
   --cfg job                               print the configuration and exit
+  algo=NAME --help                        also list the settings of the algorithm, with ranges and conditions
 """
 
 
@@ -57,7 +59,7 @@ class Own:
 def main(arguments: list[str]) -> int:
     """Train, and return the exit code."""
     if any(argument in ("-h", "--help") for argument in arguments):
-        print(USAGE.strip())
+        print(_help(arguments))
         return 0
     if any(argument.startswith("-") for argument in arguments):
         _through_hydra(arguments)
@@ -77,6 +79,19 @@ def main(arguments: list[str]) -> int:
     configs = resolve_seeds(overrides, cli.read_seeds(own.seeds)) if own.seeds is not None else [resolve(overrides)]
     _, signal_name = train(configs)
     return exit_code(signal_name) if signal_name else 0
+
+
+def _help(arguments: list[str]) -> str:
+    """The usage, and the settings of the algorithm if one is given."""
+    given = [argument.removeprefix("algo=") for argument in arguments if argument.startswith("algo=")]
+    if not given:
+        return USAGE.strip()
+    if given[-1] not in ALGORITHMS:
+        raise UserError(f"unknown algo '{given[-1]}'; choose one of: {', '.join(ALGORITHMS)}")
+    lines = describe(ALGORITHMS[given[-1]][1], "algo.")
+    title = f"Settings of {given[-1]}, with their defaults. Recipes change some of them."
+    note = "A setting that you give and that has no effect is refused."
+    return "\n".join([USAGE.strip(), "", title, note, "", *(f"  {line}" for line in lines if "algo.name=" not in line)])
 
 
 def _train_in_process(overrides: list[str], processes: Processes) -> int:

@@ -10,7 +10,7 @@ from mjx_walk.algos.on_policy import OnPolicyBatch, OnPolicyState
 from mjx_walk.algos.policy_gradient import PolicyGradientAlgorithm, PolicyGradientConfig, Samples, normalize
 from mjx_walk.common.brax_losses import PPOParams, compute_gae
 from mjx_walk.common.exploration import Exploration, NoExploration, OrnsteinUhlenbeck
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.settings import AnyBut, setting
 
 
 @dataclasses.dataclass
@@ -20,7 +20,7 @@ class A2CConfig(PolicyGradientConfig):
     name: str = setting("a2c", choices=("a2c",))
     ou_noise_std: float = setting(0.0, at_least=0)
     """Standard deviation of the increments of Ornstein-Uhlenbeck noise, added to actions in [-1, 1]; 0: no noise."""
-    ou_noise_theta: float = setting(0.15, above=0, at_most=1)
+    ou_noise_theta: float = setting(0.15, above=0, at_most=1, only_if={"ou_noise_std": AnyBut(0)})
     """The fraction of that noise that decays at every step."""
 
 

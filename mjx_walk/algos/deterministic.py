@@ -13,7 +13,7 @@ from brax.training.networks import FeedForwardNetwork
 from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm, OffPolicyConfig
 from mjx_walk.common import networks
 from mjx_walk.common.optimizers import polyak_update
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.settings import AnyBut, setting
 
 
 @dataclasses.dataclass
@@ -24,6 +24,16 @@ class DeterministicConfig(OffPolicyConfig):
     """Std of the Gaussian noise on the first environment's actions, in `[-1, 1]`."""
     max_exploration_noise: float = setting(0.1, at_least=0)
     """Std for the last environment, evenly spaced in between: some environments explore, some stay near the policy."""
+    noise_repeat: int = setting(
+        1,
+        at_least=1,
+        only_if={
+            "min_exploration_noise": AnyBut(0),
+            "max_exploration_noise": AnyBut(0),
+            "learning_starts": AnyBut(0),
+        },
+    )
+    """Steps for which a sample of exploration noise, or a random action before learning starts, is kept."""
 
 
 class DeterministicState(flax.struct.PyTreeNode):

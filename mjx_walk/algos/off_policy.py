@@ -24,7 +24,7 @@ from mjx_walk.common.optimizers import (
 )
 from mjx_walk.common.replay_buffer import Replay, ReplayBuffer, Steps
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.settings import AnyBut, setting
 from mjx_walk.utils.types import RANDOM_KEY, REPLAY, Metrics, PolicyFn, Transition, as_means
 
 
@@ -57,13 +57,17 @@ class OffPolicyConfig:
     critic_learning_rate: float = setting(3e-4, above=0)
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear"))
     """`linear`: falls to zero over `schedule_steps`."""
-    schedule_steps: int = setting(100_000_000, at_least=1)
+    schedule_steps: int = setting(
+        100_000_000,
+        at_least=1,
+        only_if={"learning_rate_schedule": AnyBut("constant"), "final_discount": AnyBut(None)},
+    )
     """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
     max_grad_norm: float | None = setting(None, above=0)
     reward_scale: float = setting(1.0, above=0)
     normalize_rewards: bool = False
     """Divide rewards by the running std of the discounted return, before `reward_scale`."""
-    normalized_return_max: float | None = setting(None, above=0)
+    normalized_return_max: float | None = setting(None, above=0, only_if={"normalize_rewards": True})
     """Upper bound of normalised returns: rewards are divided by more where a return seen so far would exceed it."""
     normalize_observations: bool = True
     observation_clip: float | None = setting(10.0, above=0)

@@ -20,7 +20,7 @@ from mjx_walk.common.exploration import Exploration, NoExploration
 from mjx_walk.common.optimizers import adapt_rate, apply_gradients, make_adam, remaining_fraction, schedule_factor
 from mjx_walk.utils import collectives
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.settings import AnyBut, setting
 from mjx_walk.utils.types import PER_DEVICE, Metric, Metrics, PolicyFn, Transition
 
 
@@ -40,8 +40,12 @@ class OnPolicyConfig:
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
     """`linear`: falls to zero over `schedule_steps`. `adaptive_kl`: also adapts the policy's rate after each batch, so
     that a batch moves the policy by a KL of about `target_kl`."""
-    target_kl: float = setting(0.01, above=0)
-    schedule_steps: int = setting(100_000_000, at_least=1)
+    target_kl: float = setting(0.01, above=0, only_if={"learning_rate_schedule": "adaptive_kl"})
+    schedule_steps: int = setting(
+        100_000_000,
+        at_least=1,
+        only_if={"learning_rate_schedule": AnyBut("constant"), "entropy_schedule": AnyBut("constant")},
+    )
     """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
     max_policy_grad_norm: float = setting(1.0, above=0)
     max_value_grad_norm: float | None = setting(None, above=0)
@@ -49,7 +53,7 @@ class OnPolicyConfig:
     discount: float = setting(0.97, at_least=0, at_most=1)
     gae_lambda: float = setting(0.95, at_least=0, at_most=1)
     entropy_coef: float = setting(1e-3, at_least=0)
-    entropy_schedule: str = setting("constant", choices=("constant", "linear"))
+    entropy_schedule: str = setting("constant", choices=("constant", "linear"), only_if={"entropy_coef": AnyBut(0)})
     """`linear`: falls to zero over `schedule_steps`."""
     value_loss_coef: float = setting(0.5, above=0)
     """Coefficient of the squared error. Brax's PPO loss halves it once more."""
@@ -66,11 +70,11 @@ class OnPolicyConfig:
     """Dtype in which networks compute. Parameters, losses and optimizers are float32."""
     distribution: str = setting("tanh_normal", choices=("tanh_normal", "normal"))
     """`tanh_normal`: squashed, with a state-dependent std. `normal`: unbounded, with the next four settings."""
-    init_noise_std: float = setting(1.0, above=0)
+    init_noise_std: float = setting(1.0, above=0, only_if={"state_dependent_std": False})
     """Initial std, if it does not depend on the state."""
-    state_dependent_std: bool = False
-    min_log_std: float = setting(-20.0, at_least=-80, at_most=80)
-    max_log_std: float = setting(2.0, at_least=-80, at_most=80)
+    state_dependent_std: bool = setting(False, only_if={"distribution": "normal"})
+    min_log_std: float = setting(-20.0, at_least=-80, at_most=80, only_if={"distribution": "normal"})
+    max_log_std: float = setting(2.0, at_least=-80, at_most=80, only_if={"distribution": "normal"})
     """Upper bound. A value equal to `min_log_std` fixes the std."""
     init_at_random_episode_step: bool = True
 

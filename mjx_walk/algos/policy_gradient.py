@@ -31,7 +31,7 @@ class PolicyGradientConfig(OnPolicyConfig):
 
     distribution: str = setting("normal", choices=("tanh_normal", "normal"))
     """`tanh_normal` diverges here: nothing holds the mean back where tanh is flat."""
-    mean_bound_coef: float = setting(1.0, at_least=0)
+    mean_bound_coef: float = setting(1.0, at_least=0, only_if={"distribution": "normal"})
     """Coefficient of the squared distance of a `normal` distribution's mean from [-1, 1], where samples are clipped."""
     num_unrolls: int = setting(1, at_least=1)
     num_minibatches: int = setting(1, at_least=1)

@@ -17,7 +17,7 @@ from mjx_walk.utils.types import Metrics, as_means
 
 @dataclasses.dataclass
 class REINFORCEConfig(PolicyGradientConfig):
-    """Settings of REINFORCE. Those of advantages and values have no effect."""
+    """Settings of REINFORCE. It has no value network, and normalizes the returns of each batch."""
 
     name: str = setting("reinforce", choices=("reinforce",))
     unroll_length: int = setting(256, at_least=1)
@@ -25,6 +25,13 @@ class REINFORCEConfig(PolicyGradientConfig):
     """A step is used only if the discount on its unobserved tail is at most this."""
     baseline: str = setting("linear", choices=("mean", "linear"))
     """Subtracted from returns: the mean of the batch, or a linear fit of its returns to its observations."""
+    gae_lambda: float = setting(0.95, at_least=0, at_most=1, only_if={})
+    value_loss_coef: float = setting(0.5, above=0, only_if={})
+    value_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 256, 256), at_least=1, only_if={})
+    max_value_grad_norm: float | None = setting(None, above=0, only_if={})
+    normalize_advantages: bool = setting(True, only_if={})
+    reward_scale: float = setting(0.1, above=0, only_if={})
+    normalize_rewards: bool = setting(False, only_if={})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

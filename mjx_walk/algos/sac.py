@@ -14,7 +14,7 @@ from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm, OffPolicyConfig
 from mjx_walk.common import networks
 from mjx_walk.common.brax_losses import SACLosses, make_sac_losses
 from mjx_walk.common.optimizers import polyak_update
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.settings import AnyBut, setting
 
 
 @dataclasses.dataclass
@@ -30,6 +30,15 @@ class SACConfig(OffPolicyConfig):
     `[-1, 1]`, so no policy has more than ln 2, and under a higher target the temperature would grow without bound."""
     final_target_entropy: float | None = setting(None, below=0.69)
     """Target entropy after `schedule_steps`, approached linearly."""
+    schedule_steps: int = setting(
+        100_000_000,
+        at_least=1,
+        only_if={
+            "learning_rate_schedule": AnyBut("constant"),
+            "final_discount": AnyBut(None),
+            "final_target_entropy": AnyBut(None),
+        },
+    )
 
 
 class SACState(flax.struct.PyTreeNode):
@@ -87,8 +96,7 @@ class SAC(OffPolicyAlgorithm):
     def losses(self, batch: Batch) -> SACLosses:
         """Brax's losses, with the target entropy of the moment."""
         first, last = self.config.target_entropy, self.config.final_target_entropy
-        last = first if last is None else last
-        target_entropy = last + (first - last) * batch.remaining
+        target_entropy = jnp.float32(first) if last is None else last + (first - last) * batch.remaining
         return make_sac_losses(self.nets, batch.reward_scale, target_entropy, self.task.action_size)
 
     def critic_loss(self, critic: Any, learner: SACState, batch: Batch, key: jax.Array) -> jax.Array:

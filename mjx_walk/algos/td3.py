@@ -4,7 +4,7 @@ import dataclasses
 from typing import ClassVar
 
 from mjx_walk.algos.deterministic import DeterministicAlgorithm, DeterministicConfig
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.settings import AnyBut, setting
 
 
 @dataclasses.dataclass
@@ -15,7 +15,7 @@ class TD3Config(DeterministicConfig):
     policy_delay: int = setting(2, at_least=1)
     target_noise: float = setting(0.2, at_least=0)
     """Std of the noise that smooths the target policy, in `[-1, 1]`."""
-    target_noise_clip: float = setting(0.5, at_least=0)
+    target_noise_clip: float = setting(0.5, at_least=0, only_if={"target_noise": AnyBut(0)})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["AnyBut", "has_effect", "refuse_ineffective", "setting", "validate"]
+__all__ = ["AnyBut", "describe", "has_effect", "refuse_ineffective", "setting", "validate"]
 
 
 class AnyBut(NamedTuple):
@@ -139,5 +139,41 @@ def _blockers(owner: Any, name: str) -> list[str] | None:
     return found
 
 
+def describe(schema: type, prefix: str = "") -> list[str]:
+    """A line for each setting of a dataclass: `key=default`, its valid range, and where it has an effect.
+
+    Settings that never have an effect are left out.
+
+    Args:
+        schema: dataclass whose fields have defaults.
+        prefix: start of the full keys, such as `algo.`.
+    """
+    lines = []
+    for field in dataclasses.fields(schema):
+        conditions = field.metadata.get("only_if")
+        if conditions == {}:
+            continue
+        notes = [_range(field.metadata), _as_text(conditions) if conditions else ""]
+        text = f"{prefix}{field.name}={_as_yaml(field.default)}"
+        lines.append(f"{text:<48} {'; '.join(note for note in notes if note)}".rstrip())
+    return lines
+
+
+def _range(limits: Any) -> str:
+    words = {"above": "above", "at_least": "at least", "at_most": "at most", "below": "below"}
+    bounds = " and ".join(f"{word} {limits[name]}" for name, word in words.items() if name in limits)
+    return bounds or "|".join(limits.get("choices", ()))
+
+
+def _as_text(conditions: dict[str, Any]) -> str:
+    alternatives = [
+        f"{other} other than {_as_yaml(wanted.value)}" if isinstance(wanted, AnyBut) else f"{other}={_as_yaml(wanted)}"
+        for other, wanted in conditions.items()
+    ]
+    return f"only with {' or '.join(alternatives)}"
+
+
 def _as_yaml(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(_as_yaml, value))}]"
     return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))

@@ -36,7 +36,8 @@ _COMMON = (
     "updates_per_chunk=1",
     "algo.schedule_steps=1500",
 )
-_ON_POLICY = ("algo.unroll_length=8", "algo.measured_steps=16", "algo.value_hidden_layer_sizes=[16,16]")
+_ON_POLICY = ("algo.unroll_length=8", "algo.measured_steps=16")
+_VALUE = ("algo.value_hidden_layer_sizes=[16,16]",)
 _OFF_POLICY = (
     "algo.unroll_length=8",
     "algo.updates_per_step=2",
@@ -50,6 +51,7 @@ _POLICY = ("algo.policy_hidden_layer_sizes=[16,16]",)
 _BASE = {
     "ppo": (
         *_ON_POLICY,
+        *_VALUE,
         *_POLICY,
         "algo.num_unrolls=2",
         "algo.num_minibatches=4",
@@ -57,7 +59,7 @@ _BASE = {
         "algo.learning_rate=0.003",
         "seed=1",
     ),
-    "a2c": (*_ON_POLICY, *_POLICY, "algo.num_unrolls=2"),
+    "a2c": (*_ON_POLICY, *_VALUE, *_POLICY, "algo.num_unrolls=2"),
     "reinforce": (*_ON_POLICY, *_POLICY, "algo.num_unrolls=2", "algo.discount=0.6", "algo.num_minibatches=2"),
     "sac": (*_OFF_POLICY, *_POLICY),
     "csac": (*_OFF_POLICY, *_POLICY, "algo.policy_learning_rate=0.01", "seed=2"),
@@ -70,11 +72,10 @@ _ALL_ON_POLICY = (
     "algo.learning_rate_schedule=adaptive_kl",
     "algo.entropy_schedule=linear",
     "algo.entropy_cost=0.01",
-    "algo.normalize_rewards=true",
-    "algo.max_value_grad_norm=0.5",
     "algo.network_dtype=bfloat16",
     "algo.observation_clip=3",
 )
+_ALL_VALUE = ("algo.normalize_rewards=true", "algo.max_value_grad_norm=0.5")
 _ALL_OFF_POLICY = (
     "algo.n_step=3",
     "algo.noise_repeat=3",
@@ -93,8 +94,20 @@ _ALL_OFF_POLICY = (
 )
 _EXPLORATION = ("algo.min_exploration_noise=0.05", "algo.max_exploration_noise=0.4")
 _ALL = {
-    "ppo": (*_ALL_ON_POLICY, "algo.distribution=normal", "algo.state_dependent_std=true", "algo.max_log_std=0.5"),
-    "a2c": (*_ALL_ON_POLICY, "algo.ou_noise_std=0.3", "algo.num_minibatches=2", "algo.normalize_advantages=false"),
+    "ppo": (
+        *_ALL_ON_POLICY,
+        *_ALL_VALUE,
+        "algo.distribution=normal",
+        "algo.state_dependent_std=true",
+        "algo.max_log_std=0.5",
+    ),
+    "a2c": (
+        *_ALL_ON_POLICY,
+        *_ALL_VALUE,
+        "algo.ou_noise_std=0.3",
+        "algo.num_minibatches=2",
+        "algo.normalize_advantages=false",
+    ),
     "reinforce": (*_ALL_ON_POLICY, "algo.baseline=mean", "algo.mean_bound_cost=0.1"),
     "sac": (*_ALL_OFF_POLICY, "algo.final_target_entropy=-1.0", "algo.init_alpha=0.1"),
     "csac": (*_ALL_OFF_POLICY, "algo.final_target_entropy=-1.0", "algo.num_atoms=31"),

@@ -1,14 +1,15 @@
 """Configurations: every recipe composes and fits its algorithm; what is saved is what is read."""
 
 import dataclasses
+import re
 import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from mjx_walk import train as train_command
 from mjx_walk.algos import ALGORITHMS, make_algorithm
-from mjx_walk.algos.ppo import PPOConfig
 from mjx_walk.api import make_task, resolve
 from mjx_walk.envs import TASKS
 from mjx_walk.experiments import planned_runs
@@ -17,16 +18,17 @@ from mjx_walk.runs.config import (
     flatten,
     load_config,
     read_config,
-    register_schemas,
+    recipe_names,
     save_config,
     training_command,
 )
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import AnyBut, setting
+from mjx_walk.utils.settings import describe, has_effect
 
 RECIPES = sorted(
     str(path.relative_to(f"{CONFIG_DIR}/recipe"))[:-5] for path in Path(CONFIG_DIR).glob("recipe/?pu/[!_]*.yaml")
 )
+ALL_RECIPES = recipe_names()
 
 SCHEDULES = ("learning_rate_schedule", "entropy_schedule", "final_discount", "final_target_entropy")
 
@@ -45,6 +47,28 @@ def test_every_recipe_fits(recipe):
 
 def test_there_is_a_recipe_for_every_task_on_every_hardware():
     assert len(RECIPES) == 2 * len(TASKS) * len(ALGORITHMS)
+
+
+def settings_of(path):
+    """All keys that a recipe and the recipes below it set."""
+    content = yaml.safe_load(path.read_text())
+    parents = [name for name in content.pop("defaults", []) if isinstance(name, str) and name != "_self_"]
+    keys = [f"{key}.{name}" for key, value in content.items() if isinstance(value, dict) for name in value]
+    keys += [key for key, value in content.items() if not isinstance(value, dict)]
+    for parent in parents:
+        folder, _, name = parent.rpartition("/")
+        keys += settings_of(path.parents[1] / (Path(folder).name or path.parent.name) / f"{name}.yaml")
+    return keys
+
+
+@pytest.mark.parametrize("recipe", ALL_RECIPES)
+def test_no_recipe_gives_a_setting_without_effect(recipe):
+    folder, _, name = recipe.partition("/")
+    env, _, algo = name.rpartition("_")
+    task = [] if folder == "report" else [f"env={env}", f"algo={algo}"]
+    config = load_config([*task, f"recipe={recipe}"])
+    given = settings_of(Path(CONFIG_DIR) / "recipe" / f"{recipe}.yaml")
+    assert len(given) > 5 and [key for key in given if not has_effect(config, key)] == []
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in Path(CONFIG_DIR).glob("recipe/report/*.yaml")))
@@ -137,28 +161,16 @@ def test_former_names_in_a_saved_configuration_load_silently_and_a_resumed_run_m
     assert resumed.algo.entropy_coef == 0.75 and resumed.iterations_per_call == 3
 
 
-@dataclasses.dataclass
-class ScheduledPPO(PPOConfig):
-    schedule_steps: int = setting(100, only_if={"learning_rate_schedule": AnyBut("constant")})
-
-
-@pytest.fixture
-def scheduled(monkeypatch):
-    """PPO, with a setting that needs another one."""
-    monkeypatch.setitem(ALGORITHMS, "ppo", (ALGORITHMS["ppo"][0], ScheduledPPO))
-    yield
-    monkeypatch.undo()
-    register_schemas()
-
-
-@pytest.mark.usefixtures("scheduled")
 def test_a_given_setting_without_effect_is_refused_unless_a_run_is_resumed(tmp_path, monkeypatch):
     given, constant, linear = (
         "algo.schedule_steps=7",
         "algo.learning_rate_schedule=constant",
         "algo.learning_rate_schedule=linear",
     )
-    message = "algo.schedule_steps=7 has no effect with algo.learning_rate_schedule=constant; change that, or leave it"
+    message = (
+        "algo.schedule_steps=7 has no effect with algo.learning_rate_schedule=constant and "
+        "algo.entropy_schedule=constant; change that, or leave it out"
+    )
     with pytest.raises(UserError, match=message):
         resolve([given, constant])
     assert resolve([given, linear]).algo.schedule_steps == 7
@@ -170,7 +182,6 @@ def test_a_given_setting_without_effect_is_refused_unless_a_run_is_resumed(tmp_p
         assert resolve([f"run_dir={tmp_path}", "resume=true", *further]).algo.schedule_steps == 7
 
 
-@pytest.mark.usefixtures("scheduled")
 def test_a_job_of_a_sweep_whose_setting_has_no_effect_is_refused(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     trained = []
@@ -179,3 +190,46 @@ def test_a_job_of_a_sweep_whose_setting_has_no_effect_is_refused(monkeypatch, tm
     with pytest.raises(UserError, match="has no effect with"):
         train_command.main(["-m", "algo.schedule_steps=7", "algo.learning_rate_schedule=linear,constant"])
     assert [config.algo.learning_rate_schedule for config in trained] == ["linear"]
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_the_help_lists_an_algorithm_s_settings_and_where_they_have_an_effect(algo, capsys):
+    train_command.main([f"algo={algo}", "--help"])
+    text = capsys.readouterr().out
+    for line in describe(ALGORITHMS[algo][1], "algo."):
+        assert line in text or line.startswith("algo.name=")
+    assert "only with learning_rate_schedule other than constant or " in text
+    assert ("algo.gae_lambda" in text) == (algo in ("ppo", "a2c"))
+
+
+WITHOUT_EFFECT = {
+    "algo=ppo algo.entropy_coef=0 algo.entropy_schedule=linear": "algo.entropy_coef=0.0",
+    "algo=ppo algo.target_kl=0.1": "algo.learning_rate_schedule=linear",
+    "algo=ppo algo.state_dependent_std=true": "algo.distribution=tanh_normal",
+    "algo=ppo algo.init_noise_std=0.1": "algo.distribution=tanh_normal",
+    "algo=a2c algo.init_noise_std=0.1 algo.state_dependent_std=true": "algo.state_dependent_std=true",
+    "algo=a2c algo.mean_bound_coef=2 algo.distribution=tanh_normal": "algo.distribution=tanh_normal",
+    "algo=a2c algo.ou_noise_theta=0.1": "algo.ou_noise_std=0.0",
+    "algo=td3 algo.target_noise_clip=0.1 algo.target_noise=0": "algo.target_noise=0.0",
+    "algo=sac algo.normalized_return_max=3": "algo.normalize_rewards=false",
+    "algo=sac algo.learning_rate_schedule=constant algo.schedule_steps=9": "algo.final_target_entropy=null",
+}
+
+
+@pytest.mark.parametrize(("overrides", "reason"), WITHOUT_EFFECT.items())
+def test_a_given_setting_without_effect_names_what_disables_it(overrides, reason):
+    with pytest.raises(UserError, match=rf"has no effect with .*{re.escape(reason)}; change that, or leave it out"):
+        load_config(overrides.split())
+
+
+def test_settings_that_have_an_effect_are_not_refused():
+    load_config(["algo=csac", "algo.normalize_rewards=false", "algo.normalized_return_max=3"])
+    load_config(
+        ["algo=sac", "algo.learning_rate_schedule=constant", "algo.final_discount=0.9", "algo.schedule_steps=9"]
+    )
+    load_config(["algo=ppo", "algo.distribution=normal", "algo.init_noise_std=0.1"])
+
+
+def test_reinforce_refuses_the_settings_of_a_value_network():
+    with pytest.raises(UserError, match=r"algo\.gae_lambda=0\.9 has no effect here; leave it out"):
+        load_config(["algo=reinforce", "algo.gae_lambda=0.9"])

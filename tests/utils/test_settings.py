@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import AnyBut, has_effect, refuse_ineffective, setting
+from mjx_walk.utils.settings import AnyBut, describe, has_effect, refuse_ineffective, setting
 
 
 @dataclasses.dataclass
@@ -61,3 +61,18 @@ def test_a_given_setting_without_effect_is_refused(values, message):
 def test_settings_that_are_not_given_are_not_refused():
     refuse_ineffective(Config(algo=Algo(noise=0.5, unused=2)), ["seed"])
     assert not has_effect(Config(), "algo.noise") and has_effect(Config(), "algo.distribution")
+
+
+def test_a_description_gives_default_range_and_condition():
+    @dataclasses.dataclass
+    class Ranges:
+        rate: float = setting(0.1, above=0, at_most=1, only_if={"mode": AnyBut("off"), "steps": None})
+        mode: str = setting("off", choices=("off", "on"))
+        sizes: tuple[int, ...] = (32, 32)
+        unused: int = setting(1, only_if={})
+
+    assert [" ".join(line.split()) for line in describe(Ranges, "algo.")] == [
+        "algo.rate=0.1 above 0 and at most 1; only with mode other than off or steps=null",
+        "algo.mode=off off|on",
+        "algo.sizes=[32,32]",
+    ]
