@@ -45,6 +45,9 @@ TINY_OFF_POLICY = (
     "algo.critic_hidden_layer_sizes=[32,32]",
     "checkpoint.every_calls=2",
 )
+OPTIMIZED = {"xla_backend_optimization_level": 1}
+"""Options of `jax.jit` for programs that take longer to run than to compile; see `conftest`."""
+
 TINY_CALL = 8 * 8
 """Environment steps of one call, with either list of settings."""
 

@@ -13,26 +13,30 @@ pytestmark = pytest.mark.slow
 AS_A_USER = {"XLA_FLAGS": ""}
 """Compiled as XLA does unasked, which `conftest` doesn't wait for elsewhere."""
 
-QUARTER = ("total_steps=150000", "algo.schedule_steps=150000")
+SHORTER = {
+    "ppo": (),
+    "td3": ("total_steps=150000",),
+    "a2c": ("total_steps=400000", "algo.schedule_steps=400000"),
+    "reinforce": ("total_steps=400000",),
+}
 
 
-@pytest.mark.parametrize(
-    ("algo", "least", "changes"), [("ppo", 2000, ()), ("td3", 400, QUARTER), ("a2c", 1500, ()), ("reinforce", 441, ())]
-)
-def test_walker2d_walks_after_the_cpu_recipe(tmp_path, algo, least, changes):
-    """The command a user without a GPU types, with its score in the real Gymnasium."""
-    done = command(
-        "train", "env=walker2d", f"algo={algo}", *changes, f"run_dir={tmp_path}/run", timeout=2400, env=AS_A_USER
-    )
+@pytest.mark.parametrize(("algo", "least"), [("ppo", 2000), ("td3", 400), ("a2c", 350), ("reinforce", 230)])
+def test_walker2d_walks_after_the_cpu_recipe(tmp_path, algo, least):
+    """The command a user without a GPU types, with its score in the real Gymnasium. An untrained policy scores UNTRAINED."""
+    arguments = ("env=walker2d", f"algo={algo}", *SHORTER[algo], f"run_dir={tmp_path}/run")
+    done = command("train", *arguments, timeout=2400, env=AS_A_USER)
     assert done.returncode == 0, done.stderr
     scores = json.loads((tmp_path / "run" / "eval_gymnasium.json").read_text())
     assert scores["mean"] >= least and len(scores["returns"]) == 100
 
 
-# What v4 changes, observations, rewards and Walker2d's friction, is no engine's matter: one of them shows it.
-@pytest.mark.parametrize(("version", "physics"), [("v5", "jax"), ("v5", "warp"), ("v4", "warp")])
-@pytest.mark.parametrize("name", TASKS)
-def test_parity_of_all_versions(name, version, physics):
+# `envs/test_parity.py` has v5 on Warp, and the next test has HumanoidStandup on JAX. What v4 changes (observations,
+# rewards, Walker2d's friction) does not depend on the engine.
+@pytest.mark.parametrize(
+    ("name", "version", "physics"), [("humanoid", "v5", "jax"), *((name, "v4", "warp") for name in TASKS)]
+)
+def test_parity_of_further_versions_and_engines(name, version, physics):
     found = parity.check(name, version, physics, num_envs=48, num_steps=120)
     assert found.is_within, "\n".join(map(str, found.errors))
 

@@ -21,6 +21,7 @@ def run():
 
 
 @renders
+@pytest.mark.slow
 def test_film_follows_the_walker_in_real_time(tmp_path, run):
     done = command("play", "run=zoo:walker2d-sac", f"out={tmp_path}/new/walk.mp4", "width=321", "height=240")
     assert done.returncode == 0 and "return 7," in done.stdout, done.stderr

@@ -88,9 +88,9 @@ def test_ppo_update_equals_brax(monkeypatch):
     assert all(np.isfinite(value) for name, value in metrics.items() if not name.startswith("eval"))
 
 
-@pytest.mark.parametrize("physics", ["jax", pytest.param("warp", marks=pytest.mark.slow), "c"])
+@pytest.mark.parametrize("physics", ["c", pytest.param("jax", marks=pytest.mark.slow)])
 def test_small_batch_training_learns(physics):
-    """Sixteen walkers that are rewarded for standing learn to stand longer, on every engine."""
+    """Sixteen walkers that are rewarded for standing learn to stand longer."""
     task = make_env("walker2d", physics=physics, forward_reward_weight=0.0)
     config = dataclasses.replace(SMALL, unroll_length=32, num_epochs=8, learning_rate=3e-3, discount=0.95)
     algorithm = PPO(task, 16, EvaluationConfig(2), config)
@@ -106,14 +106,11 @@ def test_small_batch_training_learns(physics):
     assert late[0] / late[1] > 2.5 * early[0] / early[1]
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"distribution": "normal", "learning_rate_schedule": "adaptive_kl", "normalize_rewards": True},
-        {"max_value_grad_norm": 0.5, "entropy_schedule": "linear", "learning_rate_schedule": "linear"},
-    ],
-)
-def test_options_train(changes):
+def test_options_train():
+    changes = {
+        **{"distribution": "normal", "learning_rate_schedule": "adaptive_kl", "normalize_rewards": True},
+        **{"max_value_grad_norm": 0.5, "entropy_schedule": "linear"},
+    }
     task = make_env("walker2d", physics="c")
     config = dataclasses.replace(SMALL, normalizer_warmup_steps_per_env=12, num_minibatches=2, **changes)
     algorithm = PPO(task, 8, EvaluationConfig(1), config)

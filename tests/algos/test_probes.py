@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import toy_tasks
 from brax.training.acme import running_statistics
+from helpers import OPTIMIZED
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.common import networks
@@ -96,7 +97,8 @@ def train(name, task, **changes):
 def trained(name):
     """Value and action by the toy task. Compiled once, which is what takes long here."""
     indices = jnp.arange(len(toy_tasks.OneOf.TASKS))
-    found = jax.vmap(lambda index: train(name, toy_tasks.OneOf(index)))(indices)
+    train_all = jax.vmap(lambda index: train(name, toy_tasks.OneOf(index)))
+    found = jax.jit(train_all, compiler_options=OPTIMIZED)(indices)
     value, action, finite = jax.tree.map(np.asarray, found)
     assert finite.all()
     return dict(zip(toy_tasks.OneOf.TASKS, zip(value, action, strict=True), strict=True))
@@ -126,7 +128,8 @@ def test_discounting(name):
 @pytest.mark.parametrize("name", ["csac", "sac", "td3"])
 def test_a_discount_that_changes(name):
     """The horizon grows from 2 steps to 8 during the first half of the training."""
-    value, _, _ = train(name, toy_tasks.DelayedReward(), final_discount=0.875, schedule_steps=200 * 32)
+    changes = {"final_discount": 0.875, "schedule_steps": 200 * 32}
+    value, _, _ = jax.jit(lambda: train(name, toy_tasks.DelayedReward(), **changes), compiler_options=OPTIMIZED)()
     assert np.asarray(value)[[1, 2]] == pytest.approx([0.875, 1.0], abs=0.05)
 
 

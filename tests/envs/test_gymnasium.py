@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.envs.mujoco.humanoid_v5 import mass_center
+from helpers import OPTIMIZED
 
 from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.physics import PhysicsState
@@ -46,7 +47,8 @@ def synchronized(task, state, real):
 @pytest.mark.parametrize(("name", "version"), VERSIONS)
 def test_every_step_of_an_episode(name, version):
     task = make_env(name, physics="c", version=version)
-    task.jitted = jax.jit(task.step)
+    # At optimization level 0, Humanoid's center of mass is a quarter less exact than the tolerance.
+    task.jitted = jax.jit(task.step, compiler_options=OPTIMIZED)
     real = real_env(task)
     real.reset(seed=0)
     state = task.reset_to(np.float32(real.data.qpos), np.float32(real.data.qvel))

@@ -90,6 +90,7 @@ def test_reset_observation_equals_the_c_engine(physics):
     np.testing.assert_array_equal(found.obs[:, -78:], 0.0)  # no contact forces at reset
 
 
+@pytest.mark.slow
 def test_warp_overflow_is_reported(monkeypatch):
     def overflows():
         task = make_env("humanoid_standup", physics="warp")
