@@ -15,15 +15,14 @@ AS_A_USER = {"XLA_FLAGS": ""}
 
 SHORTER = {
     "ppo": (),
-    "td3": ("total_steps=150000",),
-    "a2c": ("total_steps=400000", "algo.schedule_steps=400000"),
-    "reinforce": ("total_steps=400000",),
+    "td3": ("total_steps=150000", "algo.schedule_steps=150000"),
+    "a2c": ("total_steps=1000000", "algo.schedule_steps=1000000"),
 }
 
 
-@pytest.mark.parametrize(("algo", "least"), [("ppo", 2000), ("td3", 400), ("a2c", 350), ("reinforce", 230)])
+@pytest.mark.parametrize(("algo", "least"), [("ppo", 2000), ("td3", 400), ("a2c", 800)])
 def test_walker2d_walks_after_the_cpu_recipe(tmp_path, algo, least):
-    """The command a user without a GPU types, with its score in the real Gymnasium. An untrained policy scores UNTRAINED."""
+    """The command a user without a GPU types, with its score in the real Gymnasium: about 300 after one call."""
     arguments = ("env=walker2d", f"algo={algo}", *SHORTER[algo], f"run_dir={tmp_path}/run")
     done = command("train", *arguments, timeout=2400, env=AS_A_USER)
     assert done.returncode == 0, done.stderr
