@@ -15,7 +15,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
-from mjx_walk.envs.rewards import RewardStep, Shaping, Terms, load_reward_function, shaping_terms, term_names
+from mjx_walk.envs.reward_shaping import RewardStep, Shaping, Terms, load_reward_function, shaping_terms, term_names
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
 
@@ -95,7 +95,7 @@ class TaskOptions:
     shaping: Shaping = dataclasses.field(default_factory=Shaping)
     """Weights of additional reward terms."""
     reward_function: str | None = None
-    """`PATH.py:FUNCTION`, a custom reward that replaces Gymnasium's; see `mjx_walk.envs.rewards`."""
+    """`PATH.py:FUNCTION`, a custom reward that replaces Gymnasium's; see `mjx_walk.envs.reward_shaping`."""
 
     def __post_init__(self):
         for name, value in list(vars(self).items()):

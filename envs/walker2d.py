@@ -7,7 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from mjx_walk.envs.physics import Derived, PhysicsState
-from mjx_walk.envs.rewards import Terms
+from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.task import Carry, State, Task, TaskOptions
 from mjx_walk.utils.settings import setting
 

@@ -5,7 +5,7 @@ import dataclasses
 from mjx_walk import zoo
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
-from mjx_walk.viewing.curves import plot_run
+from mjx_walk.viewing.run_plots import plot_run
 
 USAGE = """
 usage: python -m mjx_walk.plots run=RUN_DIR

@@ -130,7 +130,7 @@ def leaves(run_dir, call):
 def train_here(run_dir, *arguments, tiny=TINY):
     """Train in this process. Curves are not drawn, which would take a quarter of the time."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("mjx_walk.viewing.curves.plot_run", lambda folder: None)
+        patched.setattr("mjx_walk.viewing.run_plots.plot_run", lambda folder: None)
         assert command_here("train", *tiny, f"run_dir={run_dir}", *arguments) == 0
 
 

@@ -15,7 +15,7 @@ from mjx_walk.runs.config import Config, flatten, read_config
 from mjx_walk.runs.metrics import Row, read_rows, write_csv
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
-from mjx_walk.viewing.curves import learning_axes, series
+from mjx_walk.viewing.run_plots import learning_axes, series
 
 MIN_SEEDS_FOR_INTERVALS = 5
 _POINTS = 200

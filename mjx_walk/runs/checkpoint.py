@@ -1,4 +1,8 @@
-"""Save and restore a complete TrainState with Orbax, atomically and with a checksum for each leaf."""
+"""Save and restore a complete TrainState with Orbax, atomically and with a checksum for each leaf.
+
+Orbax's CheckpointManager treats all parts of a step alike and synchronizes all processes at each save. Here, only the
+newest step keeps its replay buffer, and each process writes its own folder.
+"""
 
 import json
 import os

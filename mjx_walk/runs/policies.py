@@ -11,7 +11,7 @@ import numpy as np
 from mjx_walk.algos import Algorithm, make_algorithm
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.physics import resolve_engine
-from mjx_walk.envs.rewards import reward_file
+from mjx_walk.envs.reward_shaping import reward_file
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config, read_config
 from mjx_walk.runs.run_folder import RunFolder

@@ -114,7 +114,7 @@ class Recorder:
         self._writer.close()
         if self._wandb:
             self._wandb.close()
-        from mjx_walk.viewing.curves import plot_run  # imports Matplotlib, which slows the start
+        from mjx_walk.viewing.run_plots import plot_run  # imports Matplotlib, which slows the start
 
         try:
             plot_run(self._folder)

@@ -83,7 +83,7 @@ def test_of_the_last_policy_and_the_best_one_gymnasium_chooses(run, monkeypatch,
         return Scores(np.full(num_episodes, best if is_best else last), np.full(num_episodes, 3), [0], "Walker2d-v5")
 
     monkeypatch.setattr(recorder, "_score_in_gymnasium", score)
-    monkeypatch.setattr("mjx_walk.viewing.curves.plot_run", lambda folder: None)
+    monkeypatch.setattr("mjx_walk.viewing.run_plots.plot_run", lambda folder: None)
     recorder.begin(0, will_train=True)
     recorder.end(state, env_steps=80)
     scores = recorder.score(wall_seconds=1.0)

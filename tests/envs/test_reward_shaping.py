@@ -9,7 +9,7 @@ import pytest
 
 from mjx_walk import api
 from mjx_walk.envs import make_env
-from mjx_walk.envs.rewards import Shaping
+from mjx_walk.envs.reward_shaping import Shaping
 from mjx_walk.utils.errors import UserError
 
 CUSTOM_REWARD = """

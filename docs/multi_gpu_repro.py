@@ -1,7 +1,7 @@
-"""Step Warp's physics on two devices from one process: `python docs/one_process_repro.py PROGRAM [GRAPH_MODE]`.
+"""Step Warp's physics on two devices from one process: `python docs/multi_gpu_repro.py PROGRAM [GRAPH_MODE]`.
 
 Prints three lines: compiled, checked against the reference, and environment steps per second. The reference comes from
-a CPU: run `JAX_PLATFORMS=cpu NUM_STEPS=1 python docs/one_process_repro.py one` first. `UNUSED=drop` is meant to avoid
+a CPU: run `JAX_PLATFORMS=cpu NUM_STEPS=1 python docs/multi_gpu_repro.py one` first. `UNUSED=drop` is meant to avoid
 the crash of `shard_map` and `pmap`; `docs/multi_gpu.md` says why.
 """
 
@@ -137,5 +137,5 @@ def main(program, graph_mode="default", seconds=2.0):
 if __name__ == "__main__":
     faulthandler.enable()
     if len(sys.argv) not in (2, 3) or sys.argv[1] not in PROGRAMS:
-        sys.exit(f"usage: one_process_repro.py {'|'.join(PROGRAMS)} [GRAPH_MODE]")
+        sys.exit(f"usage: multi_gpu_repro.py {'|'.join(PROGRAMS)} [GRAPH_MODE]")
     main(*sys.argv[1:])
