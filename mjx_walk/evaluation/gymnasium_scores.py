@@ -39,7 +39,8 @@ class Scores:
 
     @property
     def std(self) -> float:
-        return float(self.returns.std())
+        """The sample's standard deviation over episodes (n − 1); 0 for one episode."""
+        return float(self.returns.std(ddof=1)) if len(self.returns) > 1 else 0.0
 
     def __str__(self) -> str:
         return (
