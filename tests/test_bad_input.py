@@ -24,7 +24,7 @@ from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
 
 CASES = [
-    (["env=ant"], "unknown env 'ant'; choose one of: humanoid, humanoid_standup, walker2d"),
+    (["env=snake"], f"unknown env 'snake'; choose one of: {', '.join(TASKS)}"),
     (["seed=1", "seeds=2"], "give seed=N or seeds=[…], not both"),
     (["seeds=[1,1]"], "seeds=[1, 1]: give a number of seeds, or a list of different seeds from 0 up"),
     (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo, sac, csac, td3, ddpg, a2c, reinforce"),
@@ -107,7 +107,7 @@ def test_eval_names_the_mistake(arguments, says):
 
 
 def test_a_command_prints_one_line_and_exits_with_2(tmp_path):
-    done = command("train", "env=ant", cwd=tmp_path)
+    done = command("train", "env=snake", cwd=tmp_path)
     assert done.returncode == 2
     lines = [line for line in done.stderr.splitlines() if line]
     assert len(lines) == 1 and lines[0].startswith("error: "), done.stderr
@@ -116,7 +116,7 @@ def test_a_command_prints_one_line_and_exits_with_2(tmp_path):
 
 @pytest.mark.parametrize(
     ("module", "argument"),
-    [("eval", "run=nowhere"), ("bench", "env=ant"), ("parity", "x=1"), ("compare", "seeds=0"), ("plots", "x=1")],
+    [("eval", "run=nowhere"), ("bench", "env=snake"), ("parity", "x=1"), ("compare", "seeds=0"), ("plots", "x=1")],
 )
 def test_so_do_the_others(module, argument, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -112,7 +112,7 @@ def test_actions_are_scaled_to_gymnasiums_units(name):
 @pytest.mark.parametrize(
     ("kwargs", "says"),
     [
-        ({"name": "ant"}, "unknown env 'ant'; choose one of: humanoid, humanoid_standup, walker2d"),
+        ({"name": "snake"}, f"unknown env 'snake'; choose one of: {', '.join(TASKS)}"),
         ({"version": "v3"}, "choose one of: v5, v4"),
         ({"physics": "bullet"}, "choose one of: auto, warp, jax, c"),
         ({"healthy_rewad": 1.0}, "did you mean 'healthy_reward'?"),

@@ -170,7 +170,7 @@ BAD = [
     (["seed=1"], "write seeds=N"),
     (["devices=99"], "devices=99: this machine has"),
     (["per_device=0"], "per_device=0: must be at least 1"),
-    (["env=ant"], "unknown env 'ant'"),
+    (["env=snake"], "unknown env 'snake'"),
     (["algo.discount=0.9,2.0"], "algo.discount=2.0: must be at most 1"),
     (["draw=true", "out=nowhere"], "no runs below 'nowhere'"),
     (["draw=true"], "say which runs to draw: out=DIR"),

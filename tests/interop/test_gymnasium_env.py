@@ -7,11 +7,13 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import TimeLimit
 
 import mjx_walk  # noqa: F401  registers the names
-from mjx_walk.envs import make_env
+from mjx_walk.envs import TASKS, make_env
 
-NAMES = [
-    f"mjx_walk/{task}-{version}" for task in ("Humanoid", "HumanoidStandup", "Walker2d") for version in ("v5", "v4")
-]
+NAMES = [name for name in gymnasium.registry if name.startswith("mjx_walk/")]
+
+
+def test_every_task_is_registered():
+    assert {gymnasium.spec(name).kwargs["env"] for name in NAMES} == TASKS.keys() and len(NAMES) == 2 * len(TASKS)
 
 
 @pytest.mark.filterwarnings("ignore")  # about unbounded observations
