@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import logging
 import operator
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -47,11 +48,14 @@ class Run(SavedPolicy):
 
         Args:
             episodes: number of episodes.
-            backend: `gymnasium`, the real environment, or `sim`, the engine that the run was loaded with.
+            backend: `gymnasium`, the real environment, or `sim`, the engine that the run was loaded with. Both score
+                Gymnasium's reward, `sim` with the run's shaping. A run's `reward_function` is not loaded.
             seed: seed of the resets.
         """
         if backend == "gymnasium":
             return score_in_gymnasium(self.task, self.act, episodes, seed)
+        if self.reward_function:
+            _LOGGER.warning("scoring Gymnasium's reward: the run's own, %s, is not loaded", self.reward_function)
         policy = self.algorithm.policy(self.policy_params, deterministic=True)
         return score_in_sim(self.task, policy, episodes, seed)
 
@@ -162,7 +166,9 @@ def _resume_command(configs: list[Config], folders: list[RunFolder]) -> str:
     where = f"run_dir={folders[0].path}"
     if len(folders) > 1:
         where = f"run_dir={folders[0].path.parent} 'seeds={[config.seed for config in configs]}'"
-    return f"python -m mjx_walk.train {where} resume=true"
+    source = configs[0].env.reward_function
+    reward = f" {shlex.quote(f'env.reward_function={source}')}" if source else ""
+    return f"python -m mjx_walk.train {where} resume=true{reward}"
 
 
 def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | None = None) -> Run:
@@ -183,11 +189,18 @@ def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | 
 
 
 def _as_saved(config: Config, overrides: list[str]) -> Config:
-    """The saved configuration with the given settings, if a run is resumed without naming its task or algorithm."""
+    """The saved configuration with the given settings, if a run is resumed without naming its task or algorithm.
+
+    Raises:
+        UserError: the saved run has a reward function, and the overrides do not name it. A folder must not run code.
+    """
     given = {present_key(override.partition("=")[0]) for override in overrides}
     if not (config.resume and config.run_dir) or given & {"env", "algo", "recipe"}:
         return config
     saved = read_config(run_folder.open_existing(config.run_dir).config)
+    source = saved.env.reward_function
+    if source and "env.reward_function" not in given:
+        raise UserError(f"the saved run uses the code of {source}; to run it, add env.reward_function={source}")
     for key in given - {"hardware"} | {"run_dir", "resume"}:
         saved = _with_setting(saved, key, operator.attrgetter(key)(config))
     return saved

@@ -240,10 +240,13 @@ def read_config(path: Path) -> Config:
         UserError: the file is not a configuration that this version reads.
     """
     try:
-        saved = _under_present_names(OmegaConf.load(path))
+        text = path.read_text(encoding="utf-8")
+        if "${" in text:  # would be resolved, to the value of an environment variable for instance
+            raise UserError(f"{path} contains '${{', which no saved configuration does; write the value itself")
+        saved = _under_present_names(OmegaConf.create(text))
         schema = OmegaConf.structured(Config(env=TASKS[saved.env.name][1](), algo=ALGORITHMS[saved.algo.name][1]()))
         return to_config(OmegaConf.merge(schema, saved))
-    except (KeyError, AttributeError, yaml.YAMLError, OmegaConfBaseException) as error:
+    except (KeyError, AttributeError, UnicodeDecodeError, yaml.YAMLError, OmegaConfBaseException) as error:
         raise UserError(f"{path} is not a configuration of this version: {_first_line(error)}") from error
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from mjx_walk.algos import Algorithm, make_algorithm
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.physics import resolve_engine
-from mjx_walk.envs.reward_shaping import reward_file
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config, read_config
 from mjx_walk.runs.run_folder import RunFolder
@@ -33,7 +32,10 @@ class SavedPolicy:
             UserError: no usable policy.
         """
         self.path = folder.path
-        self.config = _without_lost_reward(read_config(folder.config))
+        saved = read_config(folder.config)
+        self.reward_function = saved.env.reward_function
+        """`PATH.py:FUNCTION` of the training, which is not loaded."""
+        self.config = _without_reward_function(saved)
         engine = physics or _engine_here(self.config.physics)
         self.task = make_task(dataclasses.replace(self.config, physics=engine))
         # Acting in float32 gives the same actions on every machine.
@@ -92,9 +94,6 @@ def _engine_here(name: str) -> str:
         return "auto"
 
 
-def _without_lost_reward(config: Config) -> Config:
-    """Drop a reward function whose file is missing. The policy and its score do not need it."""
-    source = config.env.reward_function
-    if source is None or reward_file(source).is_file():
-        return config
+def _without_reward_function(config: Config) -> Config:
+    """Drop the reward function: a downloaded folder must not run code. The policy and its scores do not need it."""
     return dataclasses.replace(config, env=dataclasses.replace(config.env, reward_function=None))

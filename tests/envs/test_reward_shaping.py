@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import TINY_CALL, command_here, train_here
 
 from mjx_walk import api
 from mjx_walk.envs import make_env
@@ -104,6 +105,36 @@ def test_policy_trained_on_a_custom_reward_is_scored_by_gymnasium(custom, tmp_pa
     assert json.loads((tmp_path / "run" / "eval_gymnasium.json").read_text())["env"] == "Walker2d-v5"
     custom.unlink()  # loading and scoring the policy do not need it
     assert api.load_run("run").evaluate(1).env == "Walker2d-v5"
+
+
+def test_a_run_folder_alone_runs_no_code(tmp_path, monkeypatch, capsys):
+    """As a stranger's folder: it brings the file that its configuration names."""
+    monkeypatch.chdir(tmp_path)
+    train_here("run", f"total_steps={TINY_CALL}", "evaluation.gymnasium_episodes=1")
+    (tmp_path / "run" / "evil.py").write_text(
+        "import pathlib\npathlib.Path('ran').touch()\ndef reward(step):\n    return step.terms\n"
+    )
+    config = tmp_path / "run" / "config.yaml"
+    named = f"env.reward_function={tmp_path}/run/evil.py:reward"
+    config.write_text(
+        config.read_text().replace("reward_function: null", named.removeprefix("env.").replace("=", ": "))
+    )
+    for command, *arguments in (
+        ("eval", "run=run", "episodes=1"),
+        ("eval", "run=run", "episodes=1", "backend=sim"),
+        ("play", "run=run", "html=page.html"),
+        ("export", "run=run", "out=policy.onnx"),
+        ("plots", "run=run"),
+        ("train", "run_dir=run", "resume=true", f"total_steps={2 * TINY_CALL}"),
+    ):
+        code, printed = command_here(command, *arguments), capsys.readouterr()
+        assert not (tmp_path / "ran").exists(), command
+        assert code == (2 if command == "train" else 0), printed
+        if "backend=sim" in arguments:
+            assert "scoring Gymnasium's reward: the run's own" in printed.err
+    assert f"to run it, add {named}" in printed.err
+    train_here("run", "resume=true", f"total_steps={2 * TINY_CALL}", named, tiny=[])
+    assert (tmp_path / "ran").exists()
 
 
 @pytest.mark.parametrize(

@@ -119,6 +119,24 @@ def renamings(warned):
     return [str(warning.message) for warning in warned if " is now " in str(warning.message)]
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (b"run_dir: ${oc.env:HOME}\n", r"contains '\$\{', which no saved configuration does"),
+        (b"\xff\xfe", "is not a configuration of this version"),
+        (b"run_dir: [\n", "is not a configuration of this version"),
+        (b"seed: 1\n", "is not a configuration of this version"),
+        (b"- 1\n", "is not a configuration of this version"),
+        (b"just text\n", "is not a configuration of this version"),
+    ],
+)
+def test_a_strangers_configuration_is_refused_in_one_line(tmp_path, text, says):
+    (tmp_path / "config.yaml").write_bytes(text)
+    with pytest.raises(UserError, match=says) as error:
+        read_config(tmp_path / "config.yaml")
+    assert "\n" not in str(error.value)
+
+
 def test_a_former_name_works_on_a_command_line_and_warns_once(recwarn):
     config = flatten(resolve(FORMER))
     assert PRESENT.items() <= config.items()
