@@ -150,8 +150,8 @@ def read_meta(path: Path) -> dict[str, Any]:
 
 
 def list_steps(folder: Path) -> list[Path]:
-    """Checkpoints of a run, oldest first. Their names are zero-padded environment steps."""
-    return sorted(path for path in folder.glob("[0-9]*") if path.name.isdecimal() and path.is_dir())
+    """Checkpoints of a run, oldest first. Their names are environment steps of thirteen digits."""
+    return sorted(path for path in folder.glob("[0-9]" * 13) if path.is_dir() and not path.is_symlink())
 
 
 def step_path(folder: Path, env_steps: int) -> Path:

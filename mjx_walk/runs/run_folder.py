@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime
+import os
 from pathlib import Path
 
 from mjx_walk.runs.checkpoint import list_steps
@@ -51,14 +52,26 @@ def open_existing(path: str | Path | None) -> RunFolder:
     """Open the folder of an existing run.
 
     Raises:
-        UserError: no path, or no run at that path.
+        UserError: no path, no run at that path, or a symbolic link inside the run.
     """
     if path is None:
         raise UserError("say which run: run=RUN_DIR")
     folder = RunFolder(Path(path))
     if not folder.config.is_file():
         raise UserError(f"no run at '{path}': give the folder that holds its config.yaml")
+    _refuse_links(folder.path)
     return folder
+
+
+def _refuse_links(folder: Path) -> None:
+    """Refuse a folder whose files would be written elsewhere. What Weights & Biases links in its own folder stays."""
+    for directory, folders, files in os.walk(folder):
+        for name in [*folders, *files]:
+            path = Path(directory, name)
+            if path.is_symlink():
+                raise UserError(f"'{path}' is a symbolic link; replace it by what it points to")
+        if Path(directory) == folder:
+            folders[:] = [name for name in folders if name != "wandb"]
 
 
 def prepare(configs: list[Config]) -> tuple[list[RunFolder], list[Config]]:

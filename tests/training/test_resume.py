@@ -6,6 +6,7 @@ import pickle
 import shutil
 import signal
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +27,8 @@ from helpers import (
 from mjx_walk.api import resolve
 from mjx_walk.runs import checkpoint
 from mjx_walk.utils.subprocesses import start_module
+
+OLD_RUN = Path(__file__).parents[1] / "runs" / "old_runs" / "ppo"
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +134,25 @@ def test_signals_finish_the_call_save_and_say_how_to_continue(tmp_path, name):
     newest = checkpoint.list_steps(run_dir / "checkpoints")[-1]
     assert int(newest.name) == last
     assert resolve([f"run_dir={run_dir}", "resume=true"]).env.name == "walker2d"
+
+
+@pytest.mark.parametrize("link", ["eval_gymnasium.json", "checkpoints", "checkpoints/best/arrays", "films/x"])
+def test_a_link_in_a_run_folder_is_refused_by_all_that_write(tmp_path, capsys, link):
+    """Else a stranger's folder could make a command overwrite, or remove, what the link points to."""
+    shutil.copytree(OLD_RUN, tmp_path / "run")
+    outside, path = tmp_path / "outside", tmp_path / "run" / link
+    outside.mkdir()
+    (outside / "precious").write_text("mine")
+    shutil.rmtree(path, ignore_errors=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.symlink_to(outside, target_is_directory=True)
+    for command, *arguments in (
+        *((name, f"run={tmp_path}/run") for name in ("eval", "play", "export", "plots")),
+        ("train", f"run_dir={tmp_path}/run", "resume=true"),
+    ):
+        assert command_here(command, *arguments) == 2
+        assert f"error: '{path}' is a symbolic link" in capsys.readouterr().err
+    assert [(file.name, file.read_text()) for file in outside.iterdir()] == [("precious", "mine")]
 
 
 def test_a_resume_that_fails_changes_nothing(tmp_path):
