@@ -129,6 +129,9 @@ class Trainer:
     def score(self) -> None:
         """Score every run in the real Gymnasium with `Recorder.score`. On return or error, all saves are complete."""
         seconds = self._seconds()  # equal for all runs, in whatever order they are scored
+        num_episodes = self.config.evaluation.gymnasium_episodes
+        if num_episodes and self._processes.is_main_process:
+            _log.info("Scoring %d episodes in Gymnasium, on the CPU", num_episodes)
         try:
             for recorder in self.recorders:
                 scores = recorder.score(seconds)
