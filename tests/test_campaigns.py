@@ -16,7 +16,7 @@ AS_A_USER = {"XLA_FLAGS": ""}
 SHORTER = {
     "ppo": (),
     "td3": ("total_steps=150000", "algo.schedule_steps=150000"),
-    "a2c": ("total_steps=1000000", "algo.schedule_steps=1000000"),
+    "a2c": ("total_steps=1000000",),
 }
 
 
