@@ -207,7 +207,7 @@ def test_a_folder_with_other_settings_is_left_alone(tmp_path, monkeypatch):
 def test_seeds_that_stand_at_the_same_step_are_trained_together(tmp_path):
     """Of three seeds one has a checkpoint; first ones of all variants come first."""
     _, planned = planned_runs.plan(["env=walker2d"], ["ppo", "a2c"], [0, 1, 2], str(tmp_path), "cpu")
-    (tmp_path / "ppo" / "seed_1" / "checkpoints" / "4096").mkdir(parents=True)
+    (tmp_path / "ppo" / "seed_1" / "checkpoints" / f"{4096:013d}").mkdir(parents=True)
 
     def names(together):
         return [[run.name for run in job] for job in planned_runs.jobs(planned, together)]
