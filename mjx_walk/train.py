@@ -91,7 +91,7 @@ def _help(arguments: list[str]) -> str:
     lines = describe(ALGORITHMS[given[-1]][1], "algo.")
     title = f"Settings of {given[-1]}, with their defaults. Recipes change some of them."
     note = "A setting that you give and that has no effect is refused."
-    return "\n".join([USAGE.strip(), "", title, note, "", *(f"  {line}" for line in lines if "algo.name=" not in line)])
+    return "\n".join([USAGE.strip(), "", title, note, "", *(f"  {line}" for line in lines)])
 
 
 def _train_in_process(overrides: list[str], processes: Processes) -> int:

@@ -1,7 +1,7 @@
 """Tests run on the CPU, share one compile cache within a run, and have XLA compile quickly.
 
 Most programs here take longer to compile than to run, and programs that call back into Python, as MuJoCo's C library
-does, are in no cache. `_QUICK_COMPILE` cuts compile times to a third. The tests pass without it, too.
+does, are in no cache. `_QUICK_COMPILE` cuts compile times. `helpers.OPTIMIZED` is for programs that run for long.
 `_SAFE_REDUCTIONS` is what `mjx_walk.prepare_jax` sets; tests use JAX before they call anything that sets it.
 """
 

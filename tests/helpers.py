@@ -17,6 +17,8 @@ from mjx_walk.viewing import rendering
 
 CLONE = Path(__file__).parent.parent
 README = (CLONE / "README.md").read_text()
+OLD_RUNS = CLONE / "tests" / "runs" / "old_runs"
+"""A run folder of each algorithm, written by an earlier version."""
 
 TINY = (
     "env=walker2d",
@@ -69,7 +71,7 @@ def command(module: str, *arguments: str, **kwargs) -> subprocess.CompletedProce
 
 
 def start(module: str, *arguments: str, **kwargs) -> subprocess.Popen:
-    """The same, left running. Its two outputs are one stream. It is killed after five minutes."""
+    """`command`, left running. Its output and its errors are one stream. It is killed after five minutes."""
     process = subprocess.Popen(
         [sys.executable, "-m", f"mjx_walk.{module}", *arguments],
         stdout=subprocess.PIPE,
@@ -104,14 +106,14 @@ def wait_for_rows(process: subprocess.Popen, run_dir: Path, count: int) -> None:
 
 
 def finish(process: subprocess.Popen) -> str:
-    """Wait for a started command to end; what else it prints."""
+    """Wait for a started command to end. Returns the rest of its output."""
     rest = process.stdout.read()
     process.wait()
     return rest
 
 
 def command_here(module: str, *arguments: str) -> int:
-    """The same in this process, whose imports and programs are there already; the exit code."""
+    """Exit code of `command`, run in this process, which has the imports and programs already."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(sys, "argv", [f"mjx_walk.{module}", *arguments])
         patched.delitem(sys.modules, f"mjx_walk.{module}", raising=False)  # else runpy warns

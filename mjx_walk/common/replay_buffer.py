@@ -138,10 +138,10 @@ class ReplayBuffer:
             `next_observation` is to be multiplied by: 0 where the episode terminated on the way, else γ to the number
             of steps.
         """
-        row_key, copy_key = jax.random.split(key)
+        row_key, env_key = jax.random.split(key)
         written = jnp.minimum(replay.rows, self.num_rows)
         age = jax.random.randint(row_key, (batch_size,), 0, written - n_step)
-        env = jax.random.randint(copy_key, (batch_size,), 0, self.num_envs)
+        env = jax.random.randint(env_key, (batch_size,), 0, self.num_envs)
         first = replay.rows - written + age
         on_the_way = (first + jnp.arange(n_step)[:, None]) % self.num_rows
         ends = replay.end[on_the_way, env].astype(jnp.int32)

@@ -142,7 +142,7 @@ def _blockers(owner: Any, name: str) -> list[str] | None:
 def describe(schema: type, prefix: str = "") -> list[str]:
     """A line for each setting of a dataclass: `key=default`, its valid range, and where it has an effect.
 
-    Settings that never have an effect are left out.
+    Settings that never have an effect, or have a single valid value, are left out.
 
     Args:
         schema: dataclass whose fields have defaults.
@@ -151,7 +151,7 @@ def describe(schema: type, prefix: str = "") -> list[str]:
     lines = []
     for field in dataclasses.fields(schema):
         conditions = field.metadata.get("only_if")
-        if conditions == {}:
+        if conditions == {} or len(field.metadata.get("choices", "ab")) == 1:
             continue
         notes = [_range(field.metadata), _as_text(conditions) if conditions else ""]
         text = f"{prefix}{field.name}={_as_yaml(field.default)}"

@@ -107,12 +107,17 @@ def test_small_batch_training_learns(physics):
 
 
 def test_options_train():
-    changes = {
-        **{"distribution": "normal", "learning_rate_schedule": "adaptive_kl", "normalize_rewards": True},
-        **{"max_value_grad_norm": 0.5, "entropy_schedule": "linear"},
-    }
     task = make_env("walker2d", physics="c")
-    config = dataclasses.replace(SMALL, normalizer_warmup_steps_per_env=12, num_minibatches=2, **changes)
+    config = dataclasses.replace(
+        SMALL,
+        normalizer_warmup_steps_per_env=12,
+        num_minibatches=2,
+        distribution="normal",
+        learning_rate_schedule="adaptive_kl",
+        normalize_rewards=True,
+        max_value_grad_norm=0.5,
+        entropy_schedule="linear",
+    )
     algorithm = PPO(task, 8, EvaluationConfig(1), config)
     state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
     collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)

@@ -2,18 +2,16 @@
 
 import gzip
 import shutil
-from pathlib import Path
 
 import flax
 import jax
 import numpy as np
 import pytest
-from helpers import train_here
+from helpers import OLD_RUNS, train_here
 
 import mjx_walk
 from mjx_walk.runs import checkpoint
 
-OLD_RUNS = Path(__file__).parent / "old_runs"
 OBSERVATION = np.linspace(-1.0, 1.0, 17, dtype=np.float32)
 
 

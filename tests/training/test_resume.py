@@ -6,11 +6,11 @@ import pickle
 import shutil
 import signal
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers import (
+    OLD_RUNS,
     TINY,
     TINY_CALL,
     TINY_OFF_POLICY,
@@ -27,8 +27,6 @@ from helpers import (
 from mjx_walk.api import resolve
 from mjx_walk.runs import checkpoint
 from mjx_walk.utils.subprocesses import start_module
-
-OLD_RUN = Path(__file__).parents[1] / "runs" / "old_runs" / "ppo"
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +137,7 @@ def test_signals_finish_the_call_save_and_say_how_to_continue(tmp_path, name):
 @pytest.mark.parametrize("link", ["eval_gymnasium.json", "checkpoints", "checkpoints/best/arrays", "films/x"])
 def test_a_link_in_a_run_folder_is_refused_by_all_that_write(tmp_path, capsys, link):
     """Else a stranger's folder could make a command overwrite, or remove, what the link points to."""
-    shutil.copytree(OLD_RUN, tmp_path / "run")
+    shutil.copytree(OLD_RUNS / "ppo", tmp_path / "run")
     outside, path = tmp_path / "outside", tmp_path / "run" / link
     outside.mkdir()
     (outside / "precious").write_text("mine")
