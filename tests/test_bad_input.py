@@ -94,7 +94,7 @@ EVAL_CASES = [
     (["run=x", "episodes=ten"], "episodes=ten"),
     (["run=x", "physics=jax"], "physics=jax needs backend=sim"),
     (["run=x", "backend=brax"], "choose one of: gymnasium, sim"),
-    (["run=x", "epsodes=3"], "unknown key 'epsodes'; valid: run, episodes, backend, seed, physics"),
+    (["run=x", "epsodes=3"], "unknown key 'epsodes'; valid: run, policy, episodes, backend, seed, physics"),
     (["x"], "cannot read 'x', write key=value"),
 ]
 
