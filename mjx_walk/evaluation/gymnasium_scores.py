@@ -16,6 +16,7 @@ import numpy as np
 from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
 from mjx_walk.evaluation.gymnasium_worker import send
+from mjx_walk.utils.files import write_text
 from mjx_walk.utils.subprocesses import start_module
 from mjx_walk.utils.types import PolicyFn
 from mjx_walk.utils.versions import package_versions
@@ -60,9 +61,7 @@ class Scores:
             "versions": package_versions(),
             **facts,
         }
-        unfinished = path.with_suffix(".unfinished")
-        unfinished.write_text(json.dumps(content, indent=1))
-        unfinished.replace(path)
+        write_text(path, json.dumps(content, indent=1))
 
 
 _MAX_PARALLEL_EPISODES = 1024

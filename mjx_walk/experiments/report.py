@@ -15,6 +15,7 @@ from mjx_walk.runs.config import Config, flatten, read_config
 from mjx_walk.runs.metrics import Row, read_rows, write_csv
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import replacing, write_text
 from mjx_walk.viewing.run_plots import learning_axes, series
 
 MIN_SEEDS_FOR_INTERVALS = 3
@@ -127,7 +128,7 @@ def write_report(folder: Path) -> Path:
     try:
         _draw(groups, folder / "comparison.png")
         write_csv([_csv_row(name, run) for name, runs in groups.items() for run in runs], folder / "comparison.csv")
-        path.write_text(_markdown(groups))
+        write_text(path, _markdown(groups))
     except OSError as error:
         raise UserError(f"cannot write to '{folder}': {error.strerror}") from error
     return path
@@ -156,7 +157,8 @@ def _draw(groups: dict[str, list[LoggedRun]], path: Path) -> None:
     if handles:
         num_columns = max(160 // (len(max(labels, key=len)) + 8), 1)  # as many as fit the figure's width
         figure.legend(handles, labels, loc="outside lower center", ncols=num_columns, fontsize=9)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as new:
+        figure.savefig(new, dpi=110)
 
 
 def _markdown(groups: dict[str, list[LoggedRun]]) -> str:

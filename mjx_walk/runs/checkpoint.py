@@ -4,12 +4,13 @@ Orbax's CheckpointManager treats all parts of a step alike and synchronizes all 
 newest step keeps its replay buffer, and each process writes its own folder.
 """
 
+import contextlib
 import json
 import os
 import shutil
 import warnings
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import fresh_name, write_text
 from mjx_walk.utils.versions import __version__
 
 FORMAT = 1
@@ -29,6 +31,8 @@ _META = "meta.json"
 _ARRAYS = "arrays"
 _NUMPY = "arrays.npz"
 """File that replaces Orbax's folder for small pytrees and in processes other than the main one."""
+_UNFINISHED = ".unfinished"
+"""Suffix of folders that a save has not completed, or has replaced."""
 _REPLAY = "replay"
 """Field of the TrainState that only the newest checkpoint keeps, and the name of its folder."""
 
@@ -66,20 +70,12 @@ def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False) ->
         "mjx_walk": __version__,
         "crc32": {name: _crc32(x) for name, x in arrays.items()},
     }
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir(parents=True)
     replay = {name: x for name, x in arrays.items() if _is_replay(name)}
-    _write(unfinished / _ARRAYS, {name: x for name, x in arrays.items() if name not in replay}, as_numpy)
-    if replay:
-        _write(unfinished / _REPLAY, replay, as_numpy)
-    (unfinished / _META).write_text(json.dumps(meta))
-    former = path.with_name(f".{path.name}.former")
-    shutil.rmtree(former, ignore_errors=True)
-    if path.exists():
-        os.replace(path, former)  # atomic, unlike removing a folder
-    os.replace(unfinished, path)
-    shutil.rmtree(former, ignore_errors=True)
+    with _replacing_folder(path) as unfinished:
+        _write(unfinished / _ARRAYS, {name: x for name, x in arrays.items() if name not in replay}, as_numpy)
+        if replay:
+            _write(unfinished / _REPLAY, replay, as_numpy)
+        write_text(unfinished / _META, json.dumps(meta))
 
 
 def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
@@ -200,7 +196,7 @@ def prune(folder: Path, keep: int) -> None:
         shutil.rmtree(path)
     for path in list_steps(folder)[:-1]:
         shutil.rmtree(path / _REPLAY, ignore_errors=True)
-    for path in folder.glob(".*.unfinished"):
+    for path in folder.glob(f".*{_UNFINISHED}"):
         shutil.rmtree(path)
 
 
@@ -242,6 +238,26 @@ class BackgroundSaver:
         for path, arrays, meta in parts:
             save(path, arrays, meta)
         prune(self._folder, self._keep)
+
+
+@contextlib.contextmanager
+def _replacing_folder(path: Path) -> Iterator[Path]:
+    """Context manager for writing a folder under a fresh name. On success it replaces `path`, else it is removed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished, former = (fresh_name(path.with_suffix(_UNFINISHED)) for _ in range(2))
+    unfinished.mkdir()
+    try:
+        yield unfinished
+        if path.exists():
+            os.replace(path, former)  # atomic, unlike removing a folder
+        os.replace(unfinished, path)
+    except BaseException:
+        if former.exists():
+            os.replace(former, path)
+        raise
+    finally:
+        shutil.rmtree(former, ignore_errors=True)
+        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def _is_replay(name: str) -> bool:

@@ -23,6 +23,7 @@ from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import ENGINES
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import write_text
 from mjx_walk.utils.settings import has_effect, refuse_ineffective, setting, validate
 
 __all__ = [
@@ -230,7 +231,7 @@ def flatten(config: Config) -> dict[str, Any]:
 
 def save_config(config: Config, path: Path) -> None:
     """Write a configuration as YAML."""
-    path.write_text(OmegaConf.to_yaml(OmegaConf.structured(config)))
+    write_text(path, OmegaConf.to_yaml(OmegaConf.structured(config)))
 
 
 def read_config(path: Path) -> Config:

@@ -4,6 +4,7 @@ import importlib.util
 import json
 import logging
 import math
+import os
 import secrets
 import sys
 import time
@@ -17,6 +18,7 @@ from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.tensorboard import SummaryWriter
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import open_to_append, write_text
 
 __all__ = ["MetricsWriter", "Progress", "WandbLog", "require_wandb"]
 
@@ -37,8 +39,8 @@ class MetricsWriter:
         path = run_dir / "metrics.jsonl"
         if resume_steps is not None:
             rows = [row for row in read_rows(path) if row["env_steps"] <= resume_steps]
-            path.write_text("".join(json.dumps(row) + "\n" for row in rows))
-        self._file = path.open("a", buffering=1)
+            write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
+        self._file = os.fdopen(open_to_append(path), "a", buffering=1)
         self._events = SummaryWriter(
             str(run_dir), flush_secs=30, purge_step=None if resume_steps is None else resume_steps + 1
         )
@@ -89,7 +91,7 @@ class WandbLog:
 
         identity = folder.path / "wandb_id.txt"
         if not identity.exists():
-            identity.write_text(secrets.token_hex(4))
+            write_text(identity, secrets.token_hex(4))
         self._run: Any = wandb.init(
             project=config.wandb_project,
             id=identity.read_text().strip(),

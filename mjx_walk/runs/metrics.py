@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mjx_walk.utils.files import replacing
 from mjx_walk.utils.types import Metrics, Reduction
 
 __all__ = ["Row", "name_metrics", "physics_warnings", "read_rows", "write_csv"]
@@ -104,7 +105,7 @@ def _as_row(line: str) -> Row | None:
 def write_csv(rows: list[Row], path: Path) -> Path:
     """Write rows as CSV with a column for every name in any row. Missing values are empty."""
     names = dict.fromkeys(name for row in rows for name in row)
-    with path.open("w", newline="") as file:
+    with replacing(path) as new, new.open("w", newline="") as file:
         writer = csv.DictWriter(file, names)
         writer.writeheader()
         writer.writerows(rows)

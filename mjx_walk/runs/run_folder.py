@@ -52,24 +52,29 @@ def open_existing(path: str | Path | None) -> RunFolder:
     """Open the folder of an existing run.
 
     Raises:
-        UserError: no path, no run at that path, or a symbolic link inside the run.
+        UserError: no path, no run at that path, or a link, pipe or device inside the run.
     """
     if path is None:
         raise UserError("say which run: run=RUN_DIR")
     folder = RunFolder(Path(path))
     if not folder.config.is_file():
         raise UserError(f"no run at '{path}': give the folder that holds its config.yaml")
-    _refuse_links(folder.path)
+    _refuse_special_files(folder.path)
     return folder
 
 
-def _refuse_links(folder: Path) -> None:
-    """Refuse a folder whose files would be written elsewhere. What Weights & Biases links in its own folder stays."""
+def _refuse_special_files(folder: Path) -> None:
+    """Refuse links, which lead elsewhere, and pipes and devices, which block a reader or never end.
+
+    What Weights & Biases links in its own folder stays.
+    """
     for directory, folders, files in os.walk(folder):
         for name in [*folders, *files]:
             path = Path(directory, name)
             if path.is_symlink():
                 raise UserError(f"'{path}' is a symbolic link; replace it by what it points to")
+            if not (path.is_file() or path.is_dir()):
+                raise UserError(f"'{path}' is not a regular file; remove it")
         if Path(directory) == folder:
             folders[:] = [name for name in folders if name != "wandb"]
 

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import write_text
 from mjx_walk.viewing.episode import Episode
 
 _TEMPLATE = Path(__file__).with_name("page.html")
@@ -59,7 +60,7 @@ def write_page(episode: Episode, path: Path) -> Path:
         library=_inside_script(require_library().read_text(encoding="utf-8")),
         episode=_inside_script(json.dumps(data, separators=(",", ":"))),
     )
-    path.write_text(page, encoding="utf-8")
+    write_text(path, page)
     return path
 
 

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 
 from mjx_walk.runs.metrics import Row, read_rows, write_csv
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.utils.files import replacing
 
 _X_AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))
 """Key of a row, unit and label of each horizontal axis."""
@@ -70,7 +71,8 @@ def _learning_curve(rows: list[Row], path: Path) -> Path:
     first = figure.axes[0]
     if first.get_legend_handles_labels()[0]:
         first.legend()
-    figure.savefig(path, dpi=110)
+    with replacing(path) as new:
+        figure.savefig(new, dpi=110)
     return path
 
 
@@ -89,5 +91,6 @@ def _grid(rows: list[Row], names: list[str], ylabel: str, path: Path) -> Path:
         axes.set_xlabel("million steps", fontsize=8)
         axes.set_ylabel(ylabel, fontsize=8)
         axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as new:
+        figure.savefig(new, dpi=110)
     return path
