@@ -15,6 +15,7 @@ from mjx_walk import zoo
 from mjx_walk.algos import make_algorithm
 from mjx_walk.envs import Task
 from mjx_walk.envs.physics import resolve_engine
+from mjx_walk.envs.reward_files import only_known, reward_path
 from mjx_walk.evaluation.gymnasium_scores import Scores, score_in_gymnasium, score_in_sim
 from mjx_walk.runs import run_folder
 from mjx_walk.runs.config import Config, load_config, present_key, read_config
@@ -22,6 +23,7 @@ from mjx_walk.runs.loggers import require_wandb
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.policies import SavedPolicy, make_task
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.trust import remember, require_trusted
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.memory_check import check_replay
 from mjx_walk.training.trainer import Trainer
@@ -125,6 +127,8 @@ def train(
     processes = processes or Processes()
     with temporary_jax_settings(configs[0].matmul_precision):
         task = make_task(configs[0])
+        if task.reward_hashes and processes.is_main_process:
+            remember(configs[0].env.reward_function, task.reward_hashes)
         folders, configs = _prepare(configs, task, processes)
         trainer = Trainer(configs, task, folders, on_metrics, processes)
         with as_by_ctrl_c():
@@ -192,15 +196,18 @@ def _as_saved(config: Config, overrides: list[str]) -> Config:
     """The saved configuration with the given settings, if a run is resumed without naming its task or algorithm.
 
     Raises:
-        UserError: the saved run has a reward function, and the overrides do not name it. A folder must not run code.
+        UserError: the saved run has a reward function that neither the overrides name nor the user has named before.
+            A folder must not run code.
     """
+    if config.env.reward_function:
+        only_known(reward_path(config.env.reward_function), None)
     given = {present_key(override.partition("=")[0]) for override in overrides}
     if not (config.resume and config.run_dir) or given & {"env", "algo", "recipe"}:
         return config
     saved = read_config(run_folder.open_existing(config.run_dir).config)
     source = saved.env.reward_function
     if source and "env.reward_function" not in given:
-        raise UserError(f"the saved run uses the code of {source}; to run it, add env.reward_function={source}")
+        require_trusted(source)
     for key in given - {"hardware"} | {"run_dir", "resume"}:
         saved = _with_setting(saved, key, operator.attrgetter(key)(config))
     return saved

@@ -18,6 +18,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from mjx_walk import envs
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
@@ -42,6 +43,7 @@ __all__ = [
     "save_config",
     "to_config",
     "training_command",
+    "with_absolute_paths",
 ]
 
 _RENAMED = {
@@ -147,7 +149,7 @@ def compose_config(overrides: list[str]) -> Config:
     try:
         with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
             node = compose("train", overrides)
-        return to_config(node)
+        return with_absolute_paths(to_config(node), Path.cwd())
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(_one_line(error, overrides)) from error
 
@@ -162,6 +164,16 @@ def to_config(node: Any) -> Config:
     assert isinstance(config, Config)
     validate(config)
     return config
+
+
+def with_absolute_paths(config: Config, folder: Path) -> Config:
+    """A configuration whose files stay the same ones when the run is resumed from another working directory.
+
+    Args:
+        config: as a user gives it.
+        folder: what a relative path is relative to.
+    """
+    return dataclasses.replace(config, env=envs.with_absolute_paths(config.env, folder))
 
 
 def complete_overrides(overrides: list[str]) -> list[str]:

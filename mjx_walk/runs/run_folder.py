@@ -146,12 +146,19 @@ def _check(folder: RunFolder, config: Config) -> None:
         return
     saved = read_config(open_existing(folder.path).config)
     differing = differences(saved, config)
+    if _name_same_function(saved.env.reward_function, config.env.reward_function):  # which may have moved
+        differing = [text for text in differing if not text.startswith("env.reward_function ")]
     if differing:
         raise UserError(f"resume=true with another configuration than {folder.config}: {'; '.join(differing)}")
     if folder.gymnasium_scores.exists() and not list_steps(folder.checkpoints):
         raise UserError(f"no checkpoint in {folder.checkpoints}, although the run was scored; choose another run_dir")
     if config.total_steps < saved.total_steps:
         raise UserError(f"total_steps={config.total_steps} is below this run's {saved.total_steps}; it may only grow")
+
+
+def _name_same_function(source: str | None, other: str | None) -> bool:
+    """Whether two `PATH.py:FUNCTION` differ at most in the folder of the file."""
+    return bool(source and other) and Path(str(source)).name == Path(str(other)).name
 
 
 def _newest(folder: RunFolder) -> str:

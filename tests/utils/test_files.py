@@ -35,9 +35,14 @@ def test_a_link_put_in_place_while_the_file_is_written_is_replaced(tmp_path):
 def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "file.json"
     path.write_text("old")
-    with pytest.raises(KeyboardInterrupt), replacing(path) as new:
-        new.write_text("half")
-        raise KeyboardInterrupt
+
+    def write_half():
+        with replacing(path) as new:
+            new.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_half()
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("file.json", "old")]
 
 
