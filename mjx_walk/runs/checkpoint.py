@@ -18,8 +18,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
 
+from mjx_walk.runs.arrays import HostArrays, read_arrays, write_arrays
+from mjx_walk.runs.facts import read_facts
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import fresh_name, write_text
 from mjx_walk.utils.versions import __version__
@@ -29,8 +30,6 @@ FORMAT = 1
 
 _META = "meta.json"
 _ARRAYS = "arrays"
-_NUMPY = "arrays.npz"
-"""File that replaces Orbax's folder for small pytrees and in processes other than the main one."""
 _UNFINISHED = ".unfinished"
 """Suffix of folders that a save has not completed, or has replaced."""
 _REPLAY = "replay"
@@ -45,9 +44,6 @@ _RENAMED_LEAVES = {
     "noise": "exploration",
 }
 """Present paths of leaves, by the former paths in older checkpoints."""
-
-HostArrays = dict[str, np.ndarray]
-"""Host copies of a pytree's leaves, by path."""
 
 
 def to_host(tree: Any) -> HostArrays:
@@ -72,9 +68,10 @@ def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False) ->
     }
     replay = {name: x for name, x in arrays.items() if _is_replay(name)}
     with _replacing_folder(path) as unfinished:
-        _write(unfinished / _ARRAYS, {name: x for name, x in arrays.items() if name not in replay}, as_numpy)
+        rest = {name: x for name, x in arrays.items() if name not in replay}
+        write_arrays(unfinished / _ARRAYS, rest, as_numpy)
         if replay:
-            _write(unfinished / _REPLAY, replay, as_numpy)
+            write_arrays(unfinished / _REPLAY, replay, as_numpy)
         write_text(unfinished / _META, json.dumps(meta))
 
 
@@ -101,25 +98,20 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
         )
     wanted = _named_leaves(like)
     meta["crc32"] = {present_name(name): crc for name, crc in meta["crc32"].items()}
-    arrays = _read(path / _ARRAYS)
+    arrays = read_arrays(path / _ARRAYS, wanted, present_name)
     if any(_is_replay(name) for name in meta["crc32"]):
         if (path / _REPLAY).exists():
-            arrays |= _read(path / _REPLAY)
+            arrays |= read_arrays(path / _REPLAY, wanted, present_name)
         else:
             warnings.warn(f"{path} has no replay buffer; training refills it before learning continues", stacklevel=2)
             arrays |= {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in wanted.items() if _is_replay(name)}
             meta["crc32"] = {name: crc for name, crc in meta["crc32"].items() if not _is_replay(name)}
     for name, leaf in wanted.items():
-        if name in arrays and arrays[name].dtype.kind == "V":  # NumPy's files do not support bfloat16
-            arrays[name] = arrays[name].view(leaf.dtype)
-    for name, crc in meta["crc32"].items():
-        if name not in arrays or _crc32(arrays[name]) != crc:
+        if name in meta["crc32"] and (name not in arrays or _crc32(arrays[name]) != meta["crc32"][name]):
             raise ValueError(f"{path} is damaged: {name} does not match its checksum")
-    for name, leaf in wanted.items():
-        if name not in arrays or arrays[name].shape != leaf.shape or arrays[name].dtype != leaf.dtype:
-            found = f"{arrays[name].shape} {arrays[name].dtype}" if name in arrays else "nothing"
+        if name not in arrays:
             raise UserError(
-                f"{path} belongs to another run or version: {name} should be {leaf.shape} {leaf.dtype}, found {found}"
+                f"{path} belongs to another run or version: {name} should be {leaf.shape} {leaf.dtype}, found nothing"
             )
     leaves = [jnp.asarray(arrays[name]) for name in wanted]
     return jax.tree.unflatten(jax.tree.structure(like), leaves), meta
@@ -137,12 +129,9 @@ def read_meta(path: Path) -> dict[str, Any]:
     """Facts stored with a checkpoint.
 
     Raises:
-        ValueError: the folder is damaged.
+        ValueError: the folder is damaged, or a fact is not what it should be.
     """
-    try:
-        return json.loads((path / _META).read_text())
-    except (OSError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+    return read_facts(path / _META)
 
 
 def list_steps(folder: Path) -> list[Path]:
@@ -262,39 +251,6 @@ def _replacing_folder(path: Path) -> Iterator[Path]:
 
 def _is_replay(name: str) -> bool:
     return name.startswith(f"{_REPLAY}.")
-
-
-def _write(path: Path, arrays: HostArrays, as_numpy: bool) -> None:
-    if as_numpy or jax.process_index():  # Orbax writes host arrays only from the main process
-        path.mkdir()
-        write = np.savez_compressed if as_numpy else np.savez
-        write(path / _NUMPY, allow_pickle=False, **arrays)
-        return
-    with _checkpointer() as checkpointer:
-        checkpointer.save(path.absolute(), arrays)
-
-
-def _read(path: Path) -> HostArrays:
-    try:
-        if (path / _NUMPY).exists():
-            with np.load(path / _NUMPY) as arrays:
-                found = dict(arrays)
-        else:
-            with _checkpointer() as checkpointer:
-                found = checkpointer.restore(path.absolute())
-    except Exception as error:  # Orbax reports damage with many exception types
-        raise ValueError(f"{path} is damaged: {str(error).splitlines()[0][:200]}") from error
-    return {present_name(name): array for name, array in found.items()}
-
-
-def _checkpointer() -> ocp.Checkpointer:
-    """Orbax's checkpointer for this process alone. By default, Orbax waits for all processes."""
-    options = ocp.options.MultiprocessingOptions()
-    if jax.process_count() > 1:
-        rank = jax.process_index()
-        options = ocp.options.MultiprocessingOptions(rank, {rank}, f"process_{rank}")
-    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=options)
-    return ocp.Checkpointer(handler, multiprocessing_options=options)
 
 
 def _crc32(array: np.ndarray) -> int:

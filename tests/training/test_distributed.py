@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command, finish, start, wait_for_line, wait_for_rows
+from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command, finish, saved_leaves, start, wait_for_line, wait_for_rows
 from toy_tasks import ObservedReward
 
 from mjx_walk.algos import make_algorithm
@@ -135,9 +135,7 @@ def newest(run_dir):
     """The leaves of both devices' newest checkpoints."""
     found = []
     for folder in (run_dir / "checkpoints", run_dir / "checkpoints" / "device_1"):
-        path = checkpoint.list_steps(folder)[-1]
-        parts = [checkpoint._read(part) for part in (path / "arrays", path / "replay") if part.exists()]
-        found.append({name: leaf for part in parts for name, leaf in part.items()})
+        found.append(saved_leaves(checkpoint.list_steps(folder)[-1]))
     return found
 
 
