@@ -167,12 +167,12 @@ def _score(trainer: Trainer, folders: list[RunFolder]) -> None:
 
 
 def _resume_command(configs: list[Config], folders: list[RunFolder]) -> str:
-    where = f"run_dir={folders[0].path}"
+    where = shlex.quote(f"run_dir={folders[0].path}")
     if len(folders) > 1:
-        where = f"run_dir={folders[0].path.parent} 'seeds={[config.seed for config in configs]}'"
-    source = configs[0].env.reward_function
-    reward = f" {shlex.quote(f'env.reward_function={source}')}" if source else ""
-    return f"python -m mjx_walk.train {where} resume=true{reward}"
+        where = f"{shlex.quote(f'run_dir={folders[0].path.parent}')} 'seeds={[config.seed for config in configs]}'"
+    named = {"env.reward_function": configs[0].env.reward_function, "wandb_project": configs[0].wandb_project}
+    again = "".join(f" {shlex.quote(f'{key}={value}')}" for key, value in named.items() if value)
+    return f"python -m mjx_walk.train {where} resume=true{again}"
 
 
 def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | None = None) -> Run:
@@ -196,8 +196,8 @@ def _as_saved(config: Config, overrides: list[str]) -> Config:
     """The saved configuration with the given settings, if a run is resumed without naming its task or algorithm.
 
     Raises:
-        UserError: the saved run has a reward function that neither the overrides name nor the user has named before.
-            A folder must not run code.
+        UserError: the saved run has a reward function that neither the overrides name nor the user has named before,
+            or logs to Weights & Biases, and the overrides do not say so. A folder must not run code or upload.
     """
     if config.env.reward_function:
         only_known(reward_path(config.env.reward_function), None)
@@ -208,6 +208,10 @@ def _as_saved(config: Config, overrides: list[str]) -> Config:
     source = saved.env.reward_function
     if source and "env.reward_function" not in given:
         require_trusted(source)
+    project = saved.wandb_project
+    if project and "wandb_project" not in given:
+        named = shlex.quote(f"wandb_project={project}")
+        raise UserError(f"the saved run logs to Weights & Biases; to go on, add {named}, or wandb_project=null")
     for key in given - {"hardware"} | {"run_dir", "resume"}:
         saved = _with_setting(saved, key, operator.attrgetter(key)(config))
     return saved

@@ -147,7 +147,7 @@ def _draw(groups: dict[str, list[LoggedRun]], path: Path) -> None:
             for curve in curves:
                 axes.plot(*curve, color=color, alpha=0.35, linewidth=0.8)
             x, mean, values = mean_curve(curves)
-            axes.plot(x, mean, color=color, linewidth=2.2, label=f"{name} ({len(curves)})")
+            axes.plot(x, mean, color=color, linewidth=2.2, label=f"{name} ({len(curves)})".replace("$", r"\$"))
             bounds = interval(values)
             if bounds:
                 axes.fill_between(x, *bounds, color=color, alpha=0.2, linewidth=0)

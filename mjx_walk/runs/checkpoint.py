@@ -174,13 +174,17 @@ def restore_newest(
     raise UserError(f"no usable checkpoint in {folder}; start a new run without resume=true")
 
 
-def prune(folder: Path, keep: int) -> None:
+def prune(folder: Path, keep: int, newest: str | None = None) -> None:
     """Remove old checkpoints, old replay buffers and unfinished saves.
 
     Args:
         folder: folder of the checkpoints.
         keep: number of newest checkpoints to keep. Only the newest keeps its replay buffer.
+        newest: name of the checkpoint just saved. Later ones are removed: the run has resumed from before them.
     """
+    for path in list_steps(folder):
+        if newest and path.name > newest:
+            shutil.rmtree(path)
     for path in list_steps(folder)[:-keep]:
         shutil.rmtree(path)
     for path in list_steps(folder)[:-1]:
@@ -226,7 +230,7 @@ class BackgroundSaver:
     def _save(self, parts: list[tuple[Path, HostArrays, dict[str, Any]]]) -> None:
         for path, arrays, meta in parts:
             save(path, arrays, meta)
-        prune(self._folder, self._keep)
+        prune(self._folder, self._keep, max((path.name for path, *_ in parts if path.name.isdigit()), default=None))
 
 
 @contextlib.contextmanager

@@ -23,6 +23,7 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import ENGINES
+from mjx_walk.runs.saved_yaml import read_yaml
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import write_text
 from mjx_walk.utils.settings import has_effect, refuse_ineffective, setting, validate
@@ -253,14 +254,19 @@ def read_config(path: Path) -> Config:
         UserError: the file is not a configuration that this version reads.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-        if "${" in text:  # would be resolved, to the value of an environment variable for instance
-            raise UserError(f"{path} contains '${{', which no saved configuration does; write the value itself")
-        saved = _under_present_names(OmegaConf.create(text))
+        saved = _under_present_names(read_yaml(path))
         schema = OmegaConf.structured(Config(env=TASKS[saved.env.name][1](), algo=ALGORITHMS[saved.algo.name][1]()))
         return to_config(OmegaConf.merge(schema, saved))
-    except (KeyError, AttributeError, UnicodeDecodeError, yaml.YAMLError, OmegaConfBaseException) as error:
+    except UserError:
+        raise
+    except _UNREADABLE as error:
         raise UserError(f"{path} is not a configuration of this version: {_first_line(error)}") from error
+
+
+_UNREADABLE = (
+    *(LookupError, AttributeError, TypeError, ValueError, RecursionError),
+    *(yaml.YAMLError, OmegaConfBaseException),
+)
 
 
 def _under_present_names(saved: Any) -> Any:

@@ -5,6 +5,7 @@ import json
 import logging
 import math
 import os
+import re
 import secrets
 import sys
 import time
@@ -89,12 +90,15 @@ class WandbLog:
         """
         import wandb
 
-        identity = folder.path / "wandb_id.txt"
-        if not identity.exists():
-            write_text(identity, secrets.token_hex(4))
+        file = folder.path / "wandb_id.txt"
+        if not file.exists():
+            write_text(file, secrets.token_hex(4))
+        identity = file.read_text(encoding="utf-8", errors="replace").strip()
+        if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", identity):
+            raise UserError(f"{file} does not hold the ID of a run of Weights & Biases; remove the file")
         self._run: Any = wandb.init(
             project=config.wandb_project,
-            id=identity.read_text().strip(),
+            id=identity,
             name=f"{folder.path.parent.name}/{folder.path.name}",
             dir=str(folder.path),
             config=flatten(config),

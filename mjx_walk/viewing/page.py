@@ -58,14 +58,14 @@ def write_page(episode: Episode, path: Path) -> Path:
     page = string.Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
         title=episode.env,
         library=_inside_script(require_library().read_text(encoding="utf-8")),
-        episode=_inside_script(json.dumps(data, separators=(",", ":"))),
+        episode=json.dumps(data, separators=(",", ":")).replace("<", r"\u003c"),  # no string can end the element
     )
     write_text(path, page)
     return path
 
 
 def _inside_script(text: str) -> str:
-    """Escape JavaScript or JSON so that it cannot close the `<script>` element around it."""
+    """Escape JavaScript so that it cannot close the `<script>` element around it."""
     return re.sub("</(?=script)", r"<\\/", text, flags=re.IGNORECASE)
 
 

@@ -15,6 +15,7 @@ _X_AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0
 """Key of a row, unit and label of each horizontal axis."""
 _QUANTITIES = (("return", "return"), ("length", "episode length"))
 """Key of a row after its prefix, and label, of each vertical axis."""
+_MAX_PLOTS = 32
 
 
 def plot_run(folder: RunFolder) -> list[Path]:
@@ -77,7 +78,8 @@ def _learning_curve(rows: list[Row], path: Path) -> Path:
 
 
 def _grid(rows: list[Row], names: list[str], ylabel: str, path: Path) -> Path:
-    """Draw one small plot per metric."""
+    """Draw one small plot per metric, up to `_MAX_PLOTS`."""
+    names = names[:_MAX_PLOTS]
     num_columns = min(len(names), 4) or 1
     num_rows = -(-len(names) // num_columns) or 1
     figure = matplotlib.figure.Figure(figsize=(3.4 * num_columns, 2.4 * num_rows), layout="constrained")
@@ -87,7 +89,7 @@ def _grid(rows: list[Row], names: list[str], ylabel: str, path: Path) -> Path:
     for axes, name in zip(plots, names, strict=False):
         x, y = series(rows, "env_steps", name)
         axes.plot(x / 1e6, y)
-        axes.set_title(name.partition("/")[2], fontsize=9)
+        axes.set_title(name.partition("/")[2], fontsize=9, parse_math=False)
         axes.set_xlabel("million steps", fontsize=8)
         axes.set_ylabel(ylabel, fontsize=8)
         axes.grid(alpha=0.3)
