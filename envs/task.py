@@ -92,7 +92,7 @@ class TaskOptions:
     frame_skip: int = setting(5, at_least=1)
     reset_noise_scale: float = setting(1e-2, at_least=0)
     exclude_current_positions_from_observation: bool = True
-    max_episode_steps: int = setting(1000, at_least=1)
+    max_episode_steps: int = setting(1000, at_least=1, at_most=NO_TIME_LIMIT)
     shaping: Shaping = dataclasses.field(default_factory=Shaping)
     """Weights of additional reward terms."""
     reward_function: str | None = None

@@ -13,7 +13,7 @@ import scipy.stats
 
 from mjx_walk.runs.config import Config, flatten, read_config
 from mjx_walk.runs.metrics import Row, read_rows, write_csv
-from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.run_folder import RunFolder, open_existing
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import replacing, write_text
 from mjx_walk.viewing.run_plots import learning_axes, series
@@ -38,11 +38,11 @@ def read_runs(folder: Path) -> list[LoggedRun]:
     """Read all runs below a folder that have logged something.
 
     Raises:
-        UserError: there are none, or they are of different environments.
+        UserError: there are none, they are of different environments, or one holds links or pipes.
     """
     runs = []
     for path in sorted(folder.rglob("config.yaml")):
-        run = RunFolder(path.parent)
+        run = open_existing(path.parent)
         rows = read_rows(run.metrics)
         if rows:
             runs.append(LoggedRun(read_config(path), rows, _scores(run)))
