@@ -120,7 +120,7 @@ def test_what_a_device_gathers_stays_in_the_memory_of_what_it_had_gathered_befor
 
 
 def test_a_checkpoint_of_another_run_is_refused_not_passed_over(tmp_path):
-    checkpoint.save(checkpoint.step_path(tmp_path, 10), {"a": np.zeros(3)}, {"env_steps": 10})
+    checkpoint.save(checkpoint.step_path(tmp_path, 10), {"a": np.zeros(3)}, {"env_steps": 10, "wall_seconds": 1.0})
     with pytest.raises(UserError, match="belongs to another run"):
         restore_newest(tmp_path, {"a": np.zeros(4)}, Processes())
 
