@@ -16,13 +16,14 @@ from mjx_walk.algos import make_algorithm
 from mjx_walk.envs import Task
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.envs.reward_files import only_known, reward_path
-from mjx_walk.evaluation.gymnasium_scores import Scores, score_in_gymnasium, score_in_sim
+from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium, score_in_sim
 from mjx_walk.runs import run_folder
 from mjx_walk.runs.config import Config, load_config, present_key, read_config
 from mjx_walk.runs.loggers import require_wandb
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.policies import SavedPolicy, make_task
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.scores import BEST, Scores
 from mjx_walk.runs.trust import remember, require_trusted
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.memory_check import check_replay
@@ -38,7 +39,7 @@ _LOGGER = logging.getLogger(__name__)
 
 
 class Run(SavedPolicy):
-    """A run on disk: its configuration, metrics and best policy."""
+    """A run on disk: its configuration, metrics and one of its policies."""
 
     @functools.cached_property
     def metrics(self) -> list[Row]:
@@ -62,18 +63,19 @@ class Run(SavedPolicy):
         return score_in_sim(self.task, policy, episodes, seed)
 
 
-def load_run(path: str | Path, physics: str | None = None) -> Run:
+def load_run(path: str | Path, physics: str | None = None, policy: str = BEST) -> Run:
     """Load a run.
 
     Args:
         path: its folder, or `zoo:NAME`.
         physics: engine to use instead of the run's own.
+        policy: `best`, the policy with the highest evaluation during training, or `final`, the newest one.
 
     Raises:
         UserError: no run, or no usable policy at that path.
     """
     prepare_jax()
-    return Run(zoo.open_run(path), physics)
+    return Run(zoo.open_run(path), physics, policy)
 
 
 def resolve(overrides: list[str]) -> Config:

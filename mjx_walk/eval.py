@@ -1,16 +1,23 @@
-"""`python -m mjx_walk.eval run=RUN_DIR`: score the deterministic policy of a run."""
+"""`python -m mjx_walk.eval run=RUN_DIR`: score a policy of a run, without exploration noise."""
 
 import dataclasses
+import warnings
 
 from mjx_walk import zoo
-from mjx_walk.api import load_run
+from mjx_walk.api import Run, load_run
+from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.scores import BEST, FINAL, POLICIES, Scores, read_scores, write_scores
+from mjx_walk.training.summary import score_lines
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
 
 USAGE = """
-usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [episodes=100] [backend=gymnasium|sim] [seed=0] [physics=ENGINE]
+usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [policy=final|best] [episodes=100] [backend=gymnasium|sim] [seed=0]
+                               [physics=ENGINE]
 
+  policy=final        the newest policy; the default, except for runs that have kept only the best one, as the zoo has
+  policy=best         the policy with the highest evaluation during training
   backend=gymnasium   the real environment, on the CPU; writes eval_gymnasium.json into the run folder
   backend=sim         the run's own engine, or the one given by physics=
 """
@@ -19,6 +26,7 @@ usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [episodes=100] [backend=gymn
 @dataclasses.dataclass
 class Arguments:
     run: str | None = None
+    policy: str | None = setting(None, choices=POLICIES)
     episodes: int = setting(100, at_least=1)
     backend: str = setting("gymnasium", choices=("gymnasium", "sim"))
     seed: int = setting(0, at_least=0)
@@ -31,14 +39,28 @@ def main(command_line: list[str]) -> None:
     if arguments.physics and arguments.backend == "gymnasium":
         raise UserError(f"physics={arguments.physics} needs backend=sim: Gymnasium has its own engine")
     folder = zoo.open_run(arguments.run)
-    run = load_run(folder.path, arguments.physics)
+    name = arguments.policy or (FINAL if folder.policy(FINAL).exists() else BEST)
+    run = load_run(folder.path, arguments.physics, name)
     is_saved = arguments.backend == "gymnasium" and not zoo.holds(folder.path)
     if is_saved:
         cli.check_writable(folder.gymnasium_scores)
     scores = run.evaluate(arguments.episodes, arguments.backend, arguments.seed)
-    print(scores)
+    print(*score_lines({run.policy_name: (scores, run.policy_facts["env_steps"])}))
     if is_saved:
-        scores.save(folder.gymnasium_scores, env_steps=run.policy_facts["env_steps"])
+        _save(folder, run, scores)
+
+
+def _save(folder: RunFolder, run: Run, scores: Scores) -> None:
+    """Replace the policy's block of `eval_gymnasium.json`, and keep the other policy's."""
+    blocks, facts = {}, {}
+    if folder.gymnasium_scores.exists():
+        try:
+            former = read_scores(folder.gymnasium_scores)
+            blocks, facts = former.blocks, former.facts
+        except ValueError as error:
+            warnings.warn(f"{error}; it is replaced", stacklevel=2)
+    own = {run.policy_name: scores.block(**run.policy_facts)}
+    write_scores(folder.gymnasium_scores, scores.env, blocks | own, **facts)
 
 
 if __name__ == "__main__":

@@ -5,14 +5,16 @@ from pathlib import Path
 
 from mjx_walk import zoo
 from mjx_walk.api import load_run
+from mjx_walk.runs.scores import BEST, POLICIES
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import replacing
 from mjx_walk.utils.settings import setting
 
 USAGE = """
-usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [format=onnx] [out=FILE.onnx]
+usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [format=onnx] [out=FILE.onnx]
 
+  policy=best     the policy with the highest evaluation during training; policy=final is the newest one
   out=FILE.onnx   by default RUN_DIR/policy.onnx, or NAME.onnx in the current folder for a policy of the zoo. The model
                   maps `observation`, [N, observation_size] f64, to `action`, [N, action_size] f32, both in Gymnasium's
                   units. It normalises observations itself.
@@ -22,6 +24,7 @@ usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [format=onnx] [out=FILE.on
 @dataclasses.dataclass
 class Arguments:
     run: str | None = None
+    policy: str = setting(BEST, choices=POLICIES)
     format: str = setting("onnx", choices=("onnx",))
     out: str | None = None
 
@@ -37,7 +40,7 @@ def main(command_line: list[str]) -> None:
         from mjx_walk.interop.onnx import translate
     except ImportError as error:
         raise UserError("format=onnx needs ONNX: pip install onnx") from error
-    run = load_run(folder.path, "c")
+    run = load_run(folder.path, "c", arguments.policy)
     path = Path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.onnx")
     cli.check_writable(path)
     model = translate(run.act, run.task.observation_size, f"{run.config.env.name}_{run.config.algo.name}")

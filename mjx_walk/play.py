@@ -7,6 +7,7 @@ import imageio.v3 as iio
 
 from mjx_walk import zoo
 from mjx_walk.api import load_run
+from mjx_walk.runs.scores import BEST, POLICIES
 from mjx_walk.utils import cli
 from mjx_walk.utils.files import replacing
 from mjx_walk.utils.settings import setting
@@ -17,9 +18,10 @@ from mjx_walk.viewing.rendering import write_film
 from mjx_walk.viewing.viewer import show
 
 USAGE = """
-usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [seed=0] [width=640] [height=480] [out=FILE.mp4] [html=FILE.html]
-                               [gait=FILE.png] [strip=FILE.png start=5 seconds=1] [viewer=true]
+usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [policy=best|final] [seed=0] [width=640] [height=480] [out=FILE.mp4]
+                               [html=FILE.html] [gait=FILE.png] [strip=FILE.png start=5 seconds=1] [viewer=true]
 
+  policy=best     the policy with the highest evaluation during training; policy=final is the newest one
   out=FILE.mp4    a film of one episode. It is written by default, as RUN_DIR/episode.mp4 or, for a policy of the zoo,
                   as NAME.mp4 in the current folder.
   html=FILE.html  a page that plays the episode in 3D with its reward terms, in any browser, offline (pip install
@@ -33,6 +35,7 @@ usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [seed=0] [width=640] [height
 @dataclasses.dataclass
 class Arguments:
     run: str | None = None
+    policy: str = setting(BEST, choices=POLICIES)
     out: str | None = None
     html: str | None = None
     gait: str | None = None
@@ -62,7 +65,7 @@ def main(command_line: list[str]) -> None:
     written = [path for path in (film, html, gait, strip) if path]
     for path in written:
         cli.check_writable(path)
-    run = load_run(folder.path, "c")
+    run = load_run(folder.path, "c", arguments.policy)
     if written:
         size = None if written == [html] else (arguments.width, arguments.height)
         episode = record_episode(run.task, run.policy, arguments.seed, size)

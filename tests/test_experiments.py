@@ -27,6 +27,7 @@ MEASURES = {
     "noisy_return",
     "inline_evaluation",
     "gymnasium",
+    "target_mass",
     "speed",
     "critic_updates",
     "kl",

@@ -34,7 +34,7 @@ def test_the_folder_holds_what_it_should(finished):
         assert (run.path / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
         assert (run.path / name).stat().st_size > 10_000
     steps = sorted(path.name for path in (run.path / "checkpoints").iterdir())
-    assert steps == [f"{call * TINY_CALL:013d}" for call in (56, 58, 60)] + ["best"]
+    assert steps == [f"{call * TINY_CALL:013d}" for call in (56, 58, 60)] + ["best", "final"]
 
 
 def test_metrics_name_everything(finished):
@@ -70,20 +70,24 @@ def test_tensorboard_holds_the_same(finished):
             assert values[name, row["env_steps"]] == pytest.approx(row[name], rel=1e-5)
 
 
-def test_gymnasium_scores_are_those_of_a_plain_loop(finished):
+@pytest.mark.parametrize("name", ["final", "best"])
+def test_gymnasium_scores_are_those_of_a_plain_loop(finished, name):
     """The file's episodes, played again by the reader's own ten lines."""
     run, _ = finished
     content = json.loads((run.path / "eval_gymnasium.json").read_text())
-    assert content["env"] == "Walker2d-v5" and content["seeds"] == [0, 1, 2] and "mujoco" in content["versions"]
-    for seed, expected, length in zip(content["seeds"], content["returns"], content["lengths"], strict=True):
+    assert content["env"] == "Walker2d-v5" and "mujoco" in content["versions"]
+    block, policy = content[name], mjx_walk.load_run(run.path, policy=name)
+    assert block["seeds"] == [0, 1, 2] and block["env_steps"] == policy.policy_facts["env_steps"]
+    for seed, expected, length in zip(block["seeds"], block["returns"], block["lengths"], strict=True):
         env = gymnasium.make("Walker2d-v5", max_episode_steps=40)
         obs, _ = env.reset(seed=seed)
         total, steps, done = 0.0, 0, False
         while not done:
-            obs, reward, terminated, truncated, _ = env.step(run.policy(obs))
+            obs, reward, terminated, truncated, _ = env.step(policy.policy(obs))
             total, steps, done = total + reward, steps + 1, terminated or truncated
         assert (total, steps) == (pytest.approx(expected, rel=1e-6), length)
-    assert content["mean"] == pytest.approx(np.mean(content["returns"]))
+    assert block["mean"] == pytest.approx(np.mean(block["returns"]))
+    assert block["std"] == pytest.approx(np.std(block["returns"], ddof=1))
 
 
 def test_a_loaded_policy_scores_alike_in_its_engine_and_in_gymnasium(finished):
@@ -108,6 +112,14 @@ def test_eval_command(finished, capsys):
     run, _ = finished
     assert command_here("eval", f"run={run.path}", "episodes=2", "backend=sim") == 0
     assert "Walker2d-v5 on c" in capsys.readouterr().out
+    file = run.path / "eval_gymnasium.json"
+    before = json.loads(file.read_text())
+    for name in ("final", "best"):
+        assert command_here("eval", f"run={run.path}", f"policy={name}", "episodes=2", "seed=7") == 0
+        assert f"{name.title()} policy (step {before[name]['env_steps']:,}), Walker2d" in capsys.readouterr().out
+    after = json.loads(file.read_text())
+    assert after["final"]["seeds"] == after["best"]["seeds"] == [7, 8]
+    file.write_text(json.dumps(before))
 
 
 def test_a_sweep_puts_each_job_in_its_own_folder(tmp_path, monkeypatch, capsys):

@@ -65,7 +65,14 @@ class CSAC(SAC):
     def _expected_returns(self, _: Any, critic: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
         return jnp.exp(self.log_probs(critic, obs, action)) @ self.atoms
 
-    def critic_loss(self, critic: Any, learner: SACState, batch: Batch, key: jax.Array) -> jax.Array:
+    def critic_loss(
+        self, critic: Any, learner: SACState, batch: Batch, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The loss of the critics, `[] f32`, and the target's mass on the two outermost atoms.
+
+        `normalized_return_max` bounds the return without the entropy bonus. What the bonus adds beyond it goes to the
+        outermost atoms.
+        """
         data, distribution = batch.transitions, self.nets.parametric_action_distribution
         alpha = jnp.exp(learner.log_alpha)
         logits = self.nets.policy_network.apply(None, learner.policy, data.next_observation)
@@ -79,7 +86,8 @@ class CSAC(SAC):
         future = data.discount[:, None] * soft
         target = project(next_probs, (data.reward * batch.reward_scale)[:, None] + future, self.atoms)
         log_probs = self.log_probs(critic, data.observation, data.action)
-        return -(target[:, None] * log_probs).sum(axis=(-2, -1)).mean()
+        metrics = {"target_mass_lowest_atom": target[:, 0].mean(), "target_mass_highest_atom": target[:, -1].mean()}
+        return -(target[:, None] * log_probs).sum(axis=(-2, -1)).mean(), metrics
 
 
 def project(probs: jax.Array, positions: jax.Array, atoms: jax.Array) -> jax.Array:

@@ -99,13 +99,16 @@ class SAC(OffPolicyAlgorithm):
         target_entropy = jnp.float32(first) if last is None else last + (first - last) * batch.remaining
         return make_sac_losses(self.nets, batch.reward_scale, target_entropy, self.task.action_size)
 
-    def critic_loss(self, critic: Any, learner: SACState, batch: Batch, key: jax.Array) -> jax.Array:
-        """The loss of the critics, `[] f32`."""
-        alpha = jnp.exp(learner.log_alpha)
-        return self.losses(batch).critic(critic, learner.policy, learner.target_critic, alpha, batch.transitions, key)
+    def critic_loss(
+        self, critic: Any, learner: SACState, batch: Batch, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The loss of the critics, `[] f32`, and metrics."""
+        alpha, losses = jnp.exp(learner.log_alpha), self.losses(batch)
+        return losses.critic(critic, learner.policy, learner.target_critic, alpha, batch.transitions, key), {}
 
     def critic_update(self, learner: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, dict[str, jax.Array]]:
-        loss, grads = jax.value_and_grad(self.critic_loss)(learner.critic, learner, batch, key)
+        of_critics = jax.value_and_grad(self.critic_loss, has_aux=True)
+        (loss, metrics), grads = of_critics(learner.critic, learner, batch, key)
         rate = self.config.critic_learning_rate * batch.rate_factor
         critic, critic_optimizer = self.apply_gradients(learner.critic, grads, learner.critic_optimizer, rate)
         new_learner = learner.replace(
@@ -113,7 +116,7 @@ class SAC(OffPolicyAlgorithm):
             critic_optimizer=critic_optimizer,
             target_critic=polyak_update(learner.target_critic, critic, self.config.tau),
         )
-        return new_learner, {"critic_loss": loss, "critic_grad_norm": optax.global_norm(grads)}
+        return new_learner, metrics | {"critic_loss": loss, "critic_grad_norm": optax.global_norm(grads)}
 
     def full_update(self, learner: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, dict[str, jax.Array]]:
         config, losses = self.config, self.losses(batch)

@@ -58,7 +58,7 @@ def unroll(
 
 
 def evaluate(task: Task, num_episodes: int, policy: PolicyFn, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Play complete episodes in one batch.
+    """Play complete episodes in one batch, until the last of them has ended.
 
     Args:
         task: the unbatched environment.
@@ -72,15 +72,19 @@ def evaluate(task: Task, num_episodes: int, policy: PolicyFn, key: jax.Array) ->
     reset_key, run_key = jax.random.split(key)
     start = jax.vmap(task.reset)(jax.random.split(reset_key, num_episodes))
 
-    def one(carry, key):
+    def is_running(carry):
+        _, alive, _, _ = carry
+        return alive.any()
+
+    def step(carry):
         state, alive, returns, lengths = carry
+        key = jax.random.fold_in(run_key, lengths.max())
         state = jax.vmap(task.step)(state, policy(state.obs, key))
         returns += jnp.where(alive, state.reward, 0.0)
         lengths += alive
-        return (state, alive & ~state.terminated, returns, lengths), None
+        return state, alive & ~(state.terminated | state.truncated), returns, lengths
 
     zeros = jnp.zeros(num_episodes, jnp.float32)
     carry = (start, jnp.ones(num_episodes, bool), zeros, zeros.astype(jnp.int32))
-    keys = jax.random.split(run_key, task.options.max_episode_steps)
-    (_, _, returns, lengths), _ = jax.lax.scan(one, carry, keys)
+    _, _, returns, lengths = jax.lax.while_loop(is_running, step, carry)
     return returns, lengths

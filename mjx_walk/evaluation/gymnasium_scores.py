@@ -1,12 +1,9 @@
 """Scores of a policy: in the real Gymnasium, or in a run's own engine."""
 
 import contextlib
-import dataclasses
-import json
 import os
 import pickle
 from collections.abc import Callable
-from pathlib import Path
 from subprocess import PIPE, Popen
 from typing import Any
 
@@ -16,53 +13,9 @@ import numpy as np
 from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
 from mjx_walk.evaluation.gymnasium_worker import send
-from mjx_walk.utils.files import write_text
+from mjx_walk.runs.scores import Scores
 from mjx_walk.utils.subprocesses import start_module
 from mjx_walk.utils.types import PolicyFn
-from mjx_walk.utils.versions import package_versions
-
-
-@dataclasses.dataclass
-class Scores:
-    """Undiscounted returns and lengths of complete episodes."""
-
-    returns: np.ndarray
-    """`[N] f64`."""
-    lengths: np.ndarray
-    """`[N] i64`."""
-    seeds: list[int]
-    env: str
-    """Gymnasium's name, followed by the engine if it is not Gymnasium's."""
-
-    @property
-    def mean(self) -> float:
-        return float(self.returns.mean())
-
-    @property
-    def std(self) -> float:
-        """The sample's standard deviation over episodes (n − 1); 0 for one episode."""
-        return float(self.returns.std(ddof=1)) if len(self.returns) > 1 else 0.0
-
-    def __str__(self) -> str:
-        return (
-            f"{self.env}: {self.mean:,.1f} ± {self.std:,.1f} over {len(self.returns)} episodes, "
-            f"mean length {self.lengths.mean():,.1f}, lowest {self.returns.min():,.1f}"
-        )
-
-    def save(self, path: Path, **facts: Any) -> None:
-        """Write all episodes as JSON, with the versions of the packages and any further facts."""
-        content = {
-            "env": self.env,
-            "mean": self.mean,
-            "std": self.std,
-            "returns": self.returns.tolist(),
-            "lengths": self.lengths.tolist(),
-            "seeds": self.seeds,
-            "versions": package_versions(),
-            **facts,
-        }
-        write_text(path, json.dumps(content, indent=1))
-
 
 _MAX_PARALLEL_EPISODES = 1024
 """Episodes played at once; an environment takes about 1 MB."""

@@ -1,7 +1,6 @@
 """Reports on a folder of runs, grouped by algorithm and settings: learning curves, a Markdown table and a CSV file."""
 
 import dataclasses
-import json
 import warnings
 from collections import defaultdict
 from pathlib import Path
@@ -14,6 +13,7 @@ import scipy.stats
 from mjx_walk.runs.config import Config, flatten, read_config
 from mjx_walk.runs.metrics import Row, read_rows, write_csv
 from mjx_walk.runs.run_folder import RunFolder, open_existing
+from mjx_walk.runs.scores import BEST, BETTER, FINAL, ScoreFile, read_scores
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import replacing, write_text
 from mjx_walk.viewing.run_plots import learning_axes, series
@@ -30,8 +30,16 @@ class LoggedRun:
     config: Config
     rows: list[Row]
     """At least one."""
-    scores: dict[str, Any] | None
+    scores: ScoreFile | None
     """Contents of `eval_gymnasium.json`."""
+
+    def score(self, policy: str) -> dict[str, Any]:
+        """Scores of the final or the best policy, empty if it was not scored.
+
+        A file with one block holds the better of both, which counts as the best.
+        """
+        names = (policy, BETTER) if policy == BEST else (policy,)
+        return (self.scores and self.scores.block(*names)) or {}
 
 
 def read_runs(folder: Path) -> list[LoggedRun]:
@@ -54,12 +62,12 @@ def read_runs(folder: Path) -> list[LoggedRun]:
     return runs
 
 
-def _scores(run: RunFolder) -> dict[str, Any] | None:
+def _scores(run: RunFolder) -> ScoreFile | None:
     """Contents of a run's `eval_gymnasium.json`, if the file exists and can be read."""
     if not run.gymnasium_scores.exists():
         return None
     try:
-        return json.loads(run.gymnasium_scores.read_text())
+        return read_scores(run.gymnasium_scores)
     except ValueError:
         warnings.warn(f"{run.gymnasium_scores} cannot be read: score the run again", stacklevel=2)
         return None
@@ -162,36 +170,66 @@ def _draw(groups: dict[str, list[LoggedRun]], path: Path) -> None:
 
 
 def _markdown(groups: dict[str, list[LoggedRun]]) -> str:
-    """A table with a row per group."""
-    table = [_markdown_row(name, runs) for name, runs in groups.items()]
-    lines = [list(table[0]), ["---"] * len(table[0]), *(list(row.values()) for row in table)]
+    """A table with two rows per group, for the final and for the best policy, and a table with a row per run."""
+    summary = [_summary(name, runs, policy) for name, runs in groups.items() for policy in (FINAL, BEST)]
+    runs = [_run_cells(name, run) for name, same in groups.items() for run in same]
+    legend = (
+        "Scores are mean returns in Gymnasium. The final policy is the newest one. The best policy has the highest "
+        "evaluation during training. For files of older versions, it is the better of both on the scored episodes.\n"
+    )
+    return f"{_table(summary)}\n{_table(runs)}\n{legend}"
+
+
+def _table(rows: list[dict[str, str]]) -> str:
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def _markdown_row(variant: str, runs: list[LoggedRun]) -> dict[str, str]:
-    scores = np.array([run.scores["mean"] for run in runs if run.scores])
-    bounds = interval(scores)
+def _summary(variant: str, runs: list[LoggedRun], policy: str) -> dict[str, str]:
+    scores = np.array([run.score(policy)["mean"] for run in runs if run.score(policy)])
+    low, high = interval(scores) or (None, None)
+    iqm = scipy.stats.trim_mean(scores, 0.25) if len(scores) >= MIN_SEEDS_FOR_IQM else None
     return {
         "variant": variant,
-        "seeds": f"{len(scores)} of {len(runs)} scored" if len(scores) < len(runs) else str(len(runs)),
-        "score in Gymnasium, mean over seeds": f"{scores.mean():,.0f}" if len(scores) else "–",
-        "spread (std)": f"{scores.std(ddof=1):,.0f}" if len(scores) > 1 else "–",
-        "95% interval": f"{bounds[0]:,.0f} to {bounds[1]:,.0f}" if bounds else "–",
-        "IQM": f"{scipy.stats.trim_mean(scores, 0.25):,.0f}" if len(scores) >= MIN_SEEDS_FOR_IQM else "–",
-        "each seed": " ".join(f"{score:,.0f}" for score in scores) or "–",
+        "policy": policy,
+        "score": _cell(scores.mean() if len(scores) else None),
+        "std over seeds": _cell(scores.std(ddof=1) if len(scores) > 1 else None),
+        "95% interval, low": _cell(low),
+        "95% interval, high": _cell(high),
+        "IQM": _cell(iqm),
+        "seeds scored": str(len(scores)),
+        "seeds": str(len(runs)),
         "million steps": f"{np.mean([run.rows[-1]['env_steps'] for run in runs]) / 1e6:,.2f}",
-        "seconds": f"{np.mean([run.rows[-1]['wall_seconds'] for run in runs]):,.0f}",
-        "seeds per process": " or ".join(map(str, sorted({int(_seeds_together(run)) for run in runs}))),
+        "seconds": _cell(np.mean([run.rows[-1]["wall_seconds"] for run in runs])),
     }
 
 
+def _run_cells(variant: str, run: LoggedRun) -> dict[str, str]:
+    final, best, last = run.score(FINAL), run.score(BEST), run.rows[-1]
+    return {
+        "variant": variant,
+        "seed": str(run.config.seed),
+        "final": _cell(final.get("mean")),
+        "std over episodes": _cell(final.get("std")),
+        "best": _cell(best.get("mean")),
+        "its std over episodes": _cell(best.get("std")),
+        "million steps": f"{last['env_steps'] / 1e6:,.2f}",
+        "seconds": _cell(last["wall_seconds"]),
+        "seeds in its process": _cell(_seeds_together(run)),
+    }
+
+
+def _cell(value: Any) -> str:
+    return "–" if value is None else f"{value:,.0f}"
+
+
 def _csv_row(variant: str, run: LoggedRun) -> dict[str, Any]:
-    scores, last = run.scores or {}, run.rows[-1]
+    last = run.rows[-1]
+    scores = {f"{policy}_{name}": run.score(policy).get(name) for policy in (FINAL, BEST) for name in ("mean", "std")}
     return {
         "variant": variant,
         "seed": run.config.seed,
-        "gymnasium_mean": scores.get("mean"),
-        "gymnasium_std": scores.get("std"),
+        **scores,
         "env_steps": last["env_steps"],
         "wall_seconds": last["wall_seconds"],
         "seeds_together": _seeds_together(run),

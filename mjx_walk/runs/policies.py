@@ -1,7 +1,8 @@
-"""The best policy of a run, saved separately from its checkpoints and small enough to ship."""
+"""The final and the best policy of a run, saved separately from its checkpoints and small enough to ship."""
 
 import dataclasses
 import functools
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -14,19 +15,24 @@ from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config, read_config
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.scores import BEST, FINAL, POLICIES
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["SavedPolicy", "deterministic_act", "make_task"]
+__all__ = ["SavedPolicy", "deterministic_act", "make_acting_algorithm", "make_task"]
+
+_LOGGER = logging.getLogger(__name__)
 
 
 class SavedPolicy:
-    """The best policy of a run folder, and the task that it was trained on."""
+    """A policy of a run folder, and the task that it was trained on."""
 
-    def __init__(self, folder: RunFolder, physics: str | None = None):
+    def __init__(self, folder: RunFolder, physics: str | None = None, policy: str = BEST):
         """
         Args:
             folder: folder of a run that has saved a policy.
             physics: engine to use instead of the run's own.
+            policy: `final`, the one of the newest checkpoint, or `best`, the one with the highest evaluation during
+                training. Before the first evaluation ends, there is only `final`, and `best` gives that one.
 
         Raises:
             UserError: no usable policy.
@@ -38,12 +44,12 @@ class SavedPolicy:
         self.config = _without_reward_function(saved)
         engine = physics or _engine_here(self.config.physics)
         self.task = make_task(dataclasses.replace(self.config, physics=engine))
-        # Acting in float32 gives the same actions on every machine.
-        algo = dataclasses.replace(self.config.algo, network_dtype="float32")
-        self.algorithm = make_algorithm(self.task, self.config.num_envs, self.config.evaluation, algo)
+        self.algorithm = make_acting_algorithm(self.task, self.config)
         state = jax.eval_shape(self.algorithm.init, jax.random.PRNGKey(0))
         like = jax.eval_shape(self.algorithm.policy_params, state)
-        self.policy_params, self.policy_facts = load_best_policy(folder, like)
+        self.policy_name = choose_policy(folder, policy)
+        """`final` or `best`."""
+        self.policy_params, self.policy_facts = load_policy(folder, self.policy_name, like)
 
     @functools.cached_property
     def act(self) -> Callable:
@@ -64,26 +70,50 @@ def make_task(config: Config) -> Task:
     return TASKS[config.env.name][0](config.env, config.physics)
 
 
+def make_acting_algorithm(task: Task, config: Config) -> Algorithm:
+    """The algorithm of a configuration, in float32: a policy then acts alike on every machine."""
+    algo = dataclasses.replace(config.algo, network_dtype="float32")
+    return make_algorithm(task, config.num_envs, config.evaluation, algo)
+
+
 def deterministic_act(algorithm: Algorithm, policy_params: Any) -> Callable[[Any], Any]:
     """Compile the deterministic policy, `obs […, observation_size] → action […, action_size]`, in Gymnasium's units."""
     policy = algorithm.policy(policy_params, deterministic=True)
     return jax.jit(lambda obs: policy(obs, jax.random.PRNGKey(0)))
 
 
-def load_best_policy(folder: RunFolder, like: Any) -> tuple[Any, dict[str, Any]]:
-    """The best policy of a run and its facts; see `checkpoint.restore`.
+def choose_policy(folder: RunFolder, name: str) -> str:
+    """The name itself if the run has kept that policy; `final` in place of `best` if no evaluation has ended yet.
 
     Raises:
-        UserError: the run has saved none yet, it is damaged, or it belongs to another environment.
+        UserError: an unknown name, or the run has not kept that policy.
     """
-    if not folder.best_policy.exists():
+    if name not in POLICIES:
+        raise UserError(f"policy={name}: choose one of: {', '.join(POLICIES)}")
+    kept = [present for present in POLICIES if folder.policy(present).exists()]
+    if not kept:
         raise UserError(f"{folder.path} holds no policy yet; train it first")
+    if name in kept:
+        return name
+    if name == FINAL:
+        raise UserError(f"{folder.path} has kept only its best policy; choose policy=best")
+    _LOGGER.info("No evaluation during training has ended yet: this is the final policy.")
+    return FINAL
+
+
+def load_policy(folder: RunFolder, name: str, like: Any) -> tuple[Any, dict[str, Any]]:
+    """A policy that a run has kept, its `env_steps`, and `eval_return` if an evaluation during training chose it.
+
+    Raises:
+        UserError: the policy is damaged, or it belongs to another environment.
+    """
     try:
-        return checkpoint.restore(folder.best_policy, like)
+        params, meta = checkpoint.restore(folder.policy(name), like)
     except UserError:
         raise
     except ValueError as error:
         raise UserError(str(error)) from error
+    return params, {name: meta[name] for name in ("env_steps", "eval_return") if name in meta}
 
 
 def _engine_here(name: str) -> str:

@@ -33,9 +33,9 @@ class RunFolder:
     def checkpoints(self) -> Path:
         return self.path / "checkpoints"
 
-    @property
-    def best_policy(self) -> Path:
-        return self.checkpoints / "best"
+    def policy(self, name: str) -> Path:
+        """Folder of a kept policy, `final` or `best`."""
+        return self.checkpoints / name
 
     @property
     def gymnasium_scores(self) -> Path:

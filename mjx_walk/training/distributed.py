@@ -80,10 +80,11 @@ def join_processes() -> Processes:
 
 
 def per_device(config: Any, process_count: int) -> Any:
-    """Settings of an algorithm for one of several devices, which counts only its own steps."""
+    """Settings of an algorithm or of the evaluation for one of several devices, which counts only its own steps."""
     if process_count == 1:
         return config
-    names = {field.name for field in dataclasses.fields(config)} & {"schedule_steps", "learning_starts"}
+    counts = {"schedule_steps", "learning_starts", "every_steps"}
+    names = {field.name for field in dataclasses.fields(config)} & counts
     return dataclasses.replace(config, **{name: -(-getattr(config, name) // process_count) for name in names})
 
 
@@ -109,7 +110,10 @@ def make_devices_program(algorithm: Algorithm, processes: Processes, iterations_
 def _init_on_device(algorithm: Algorithm, process_index: int, key: jax.Array) -> TrainState:
     """Initial state of a device. Leaves that are per device start from the device's own key."""
     shared, own = algorithm.init(key), algorithm.init(jax.random.fold_in(key, process_index))
-    return _expand(map_marked(lambda _, leaf: leaf, "per_device", shared, own))
+    state = map_marked(lambda _, leaf: leaf, "per_device", shared, own)
+    # The devices act with the shared policy, so that is the one that their first evaluation scores.
+    policies = {"policy_params": algorithm.policy_params(shared), "best_policy_params": algorithm.policy_params(shared)}
+    return _expand(state.replace(evaluation=state.evaluation.replace(**policies)))
 
 
 def _make_step(algorithm: Algorithm, processes: Processes, iterations_per_call: int) -> Step:

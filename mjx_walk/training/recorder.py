@@ -2,17 +2,19 @@
 
 import logging
 import math
+from collections.abc import Callable
 from typing import Any
 
 from mjx_walk.algos import Algorithm, TrainState
 from mjx_walk.envs import Task
-from mjx_walk.evaluation.gymnasium_scores import Scores, score_in_gymnasium
+from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config, save_config
 from mjx_walk.runs.loggers import MetricsWriter, WandbLog
 from mjx_walk.runs.metrics import Row
-from mjx_walk.runs.policies import deterministic_act
+from mjx_walk.runs.policies import deterministic_act, make_acting_algorithm
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.scores import BEST, FINAL, Scores, write_scores
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.distributed_checkpoint import NUM_DEVICES, device_folder, restore_newest
 from mjx_walk.viewing.film import Filmer
@@ -43,7 +45,7 @@ class Recorder:
         self._writer: MetricsWriter | None = None
         self._wandb: WandbLog | None = None
         self._filmer = Filmer(config, folder) if config.evaluation.films else None
-        self._policies: list[tuple[Any, dict[str, Any]]] = []
+        self._policies: dict[str, tuple[Any, dict[str, Any]]] = {}
 
     @property
     def _is_main_process(self) -> bool:
@@ -55,10 +57,7 @@ class Recorder:
         Args:
             like: TrainState of shapes and dtypes.
         """
-        state, facts = restore_newest(self._folder.checkpoints, like, self._processes)
-        if self._best_policy(state):
-            self._best_iteration = int(state.evaluation.best_iteration)
-        return state, facts
+        return restore_newest(self._folder.checkpoints, like, self._processes)
 
     def begin(self, env_steps: int, will_train: bool) -> None:
         """Open the logs. Save the configuration of a resumed run.
@@ -89,26 +88,31 @@ class Recorder:
             self._filmer.take(policy_params, env_steps)
 
     def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:
-        """Start to save the complete state, and first the best policy if it is new.
+        """Start to save the complete state, and first the final policy, and the best one if it is new.
 
-        Until the first evaluation ends, the current policy counts as the best. A state with a replay buffer may take
-        long to save.
+        A state with a replay buffer may take long to save.
         """
         facts = {"env_steps": env_steps, "wall_seconds": wall_seconds, NUM_DEVICES: self._processes.process_count}
         parts: list[Any] = [(checkpoint.step_path(self._checkpoints, env_steps), state, facts)]
-        best = self._best_policy(state)
-        if not self._is_main_process:
-            pass
-        elif not best:
-            present = self._algorithm.policy_params(state)
-            parts.insert(0, (self._folder.best_policy, present, {"env_steps": env_steps}))
-        elif int(state.evaluation.best_iteration) != self._best_iteration:
-            self._best_iteration = int(state.evaluation.best_iteration)
-            parts.insert(0, (self._folder.best_policy, *best))
+        if self._is_main_process:
+            final = (self._algorithm.policy_params(state), {"env_steps": env_steps})
+            parts.insert(0, (self._folder.policy(FINAL), *final))
+            best = self._best_policy(state)
+            if best and int(state.evaluation.best_iteration) != self._best_iteration:
+                self._best_iteration = int(state.evaluation.best_iteration)
+                parts.insert(0, (self._folder.policy(BEST), *best))
         self._saver.save(*parts)
 
-    def end(self, state: TrainState, env_steps: int) -> None:
-        """Close the logs, draw the curves, and keep the policies that may be scored."""
+    def end(self, state: TrainState, env_steps: int, evaluate: Callable[[Any], float] | None) -> None:
+        """Close the logs, draw the curves, and keep the policies that are to be scored.
+
+        Args:
+            state: the last TrainState.
+            env_steps: its environment steps.
+            evaluate: mean return of a policy in the training's own engine, if training is complete. The evaluations
+                during training have not reached the final policy yet, so it has its own evaluation here. If that is
+                the highest one, the final policy is also the best.
+        """
         if not self._writer:
             return
         self._writer.close()
@@ -120,38 +124,45 @@ class Recorder:
             plot_run(self._folder)
         except OSError as error:
             _log.warning(f"cannot draw the curves of {self._folder.path}: {error}; draw them with mjx_walk.plots")
-        self._policies = [(self._algorithm.policy_params(state), {"env_steps": env_steps})]
+        final: Any = self._algorithm.policy_params(state)
+        facts: dict[str, Any] = {"env_steps": env_steps}
         best = self._best_policy(state)
-        if best:
-            self._policies.append(best)
+        if evaluate:
+            facts |= {"eval_return": evaluate(final)}
+            if not best or facts["eval_return"] > best[1]["eval_return"]:
+                best = (final, facts)
+                self._saver.save((self._folder.policy(BEST), *best))
+        self._policies = {FINAL: (final, facts)} | ({BEST: best} if best else {})
 
-    def score(self, wall_seconds: float) -> Scores | None:
-        """Score the last policy in the real Gymnasium, and write `eval_gymnasium.json`.
+    def score(self, wall_seconds: float) -> dict[str, tuple[Scores, int]]:
+        """Score the final and the best policy in the real Gymnasium, and write `eval_gymnasium.json`.
 
-        An earlier policy with a higher inline evaluation is scored too, and the better score is kept. With a custom
-        reward only that earlier policy is scored, because Gymnasium's reward is not the training objective.
+        Both act in float32. The best policy was chosen by other episodes than those that are scored here.
+
+        Returns:
+            The scores and the environment steps of each policy, by its name. Without scoring, none.
         """
         num_episodes = self.config.evaluation.gymnasium_episodes
         if not num_episodes or not self._policies:
-            return None
-        scored: list[tuple[Scores, Any, dict[str, Any]]] = []
-        candidates = self._policies[-1:] if self._task.has_custom_reward else self._policies
-        for params, facts in candidates:
-            if not scored or facts["eval_return"] > scored[0][0].mean:
-                scored.append((self._score_in_gymnasium(params, num_episodes), params, facts))
-        scores, params, facts = max(scored, key=lambda candidate: candidate[0].mean)
-        scores.save(self._folder.gymnasium_scores, env_steps=facts["env_steps"], wall_seconds=wall_seconds)
-        self._saver.save((self._folder.best_policy, params, facts))
-        return scores
+            return {}
+        acting = make_acting_algorithm(self._task, self.config)
+        scored: dict[str, tuple[Scores, int]] = {}
+        blocks = {}
+        for name, (params, facts) in self._policies.items():
+            if scored and facts is self._policies[FINAL][1]:  # the final policy is also the best
+                scores = scored[FINAL][0]
+            else:
+                scores = score_in_gymnasium(self._task, deterministic_act(acting, params), num_episodes)
+            scored[name] = (scores, facts["env_steps"])
+            blocks[name] = scores.block(**facts)
+        write_scores(self._folder.gymnasium_scores, self._task.gymnasium_id, blocks, wall_seconds=wall_seconds)
+        return scored
 
     def wait(self) -> None:
         """Wait until all files are on disk."""
         self._saver.wait()
         if self._filmer:
             self._filmer.wait()
-
-    def _score_in_gymnasium(self, policy_params: Any, num_episodes: int) -> Scores:
-        return score_in_gymnasium(self._task, deterministic_act(self._algorithm, policy_params), num_episodes)
 
     def _best_policy(self, state: TrainState) -> tuple[Any, dict[str, Any]] | None:
         """Policy with the highest inline evaluation, and its facts. None until the first evaluation ends."""

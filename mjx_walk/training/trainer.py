@@ -2,16 +2,19 @@
 
 import collections
 import dataclasses
+import functools
 import logging
 import signal
 import time
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
 
 from mjx_walk.algos import TrainState, make_algorithm
+from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
 from mjx_walk.runs.checkpoint import list_steps
 from mjx_walk.runs.config import Config
@@ -21,6 +24,7 @@ from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.training.distributed import Processes, make_devices_program, per_device
 from mjx_walk.training.programs import Program, make_init, make_seeds_program, make_single_program
 from mjx_walk.training.recorder import Recorder
+from mjx_walk.training.summary import end_lines, score_lines
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.signals import Interrupt
@@ -30,6 +34,8 @@ _log = logging.getLogger(__name__)
 
 _SPEED_WINDOW = 10.0
 """Seconds over which the logged speed is averaged."""
+_CLOSING_EVALUATION = 2**31 - 1
+"""Folded into a run's seed, so that the evaluation at the end has its own episodes."""
 
 
 class Trainer:
@@ -59,7 +65,7 @@ class Trainer:
         algorithm = make_algorithm(
             task,
             config.num_envs,
-            config.evaluation,
+            per_device(config.evaluation, count),
             per_device(config.algo, count),
             axis_name=DEVICES if count > 1 else None,
         )
@@ -72,6 +78,9 @@ class Trainer:
         self.steps_per_call = self._steps_per_iteration * config.iterations_per_call
         self.num_calls = -(-config.total_steps // self.steps_per_call)
         self._program = self._make_program()
+        self._evaluate = jax.jit(
+            lambda params, key: evaluate(task, algorithm.evaluator.num_envs, algorithm.policy(params), key)[0].mean()
+        )
         self._on_metrics = on_metrics or (lambda row: None)
         self._started = time.monotonic()
         self._times: collections.deque[tuple[float, int]] = collections.deque()
@@ -127,20 +136,26 @@ class Trainer:
         return signal_name
 
     def score(self) -> None:
-        """Score every run in the real Gymnasium with `Recorder.score`. On return or error, all saves are complete."""
+        """Score every run in the real Gymnasium with `Recorder.score`, and log the last lines of the training.
+
+        On return or error, all saves are complete.
+        """
         seconds = self._seconds()  # equal for all runs, in whatever order they are scored
         num_episodes = self.config.evaluation.gymnasium_episodes
-        if num_episodes and self._processes.is_main_process:
-            _log.info("Scoring %d episodes in Gymnasium, on the CPU", num_episodes)
+        is_main = self._processes.is_main_process
+        if num_episodes and is_main:
+            _log.info("Scoring %d episodes of each policy in Gymnasium, on the CPU", num_episodes)
         try:
             for recorder in self.recorders:
-                scores = recorder.score(seconds)
-                which = f"seed {recorder.config.seed}: " if len(self.recorders) > 1 else ""
-                if scores:
-                    _log.info(f"{which}In the real Gymnasium, {scores}")
+                seed = recorder.config.seed if len(self.recorders) > 1 else None
+                for line in score_lines(recorder.score(seconds), self.num_calls * self.steps_per_call, seed):
+                    _log.info(line)
         finally:
             for recorder in self.recorders:
                 recorder.wait()
+        paths = [folder.path for folder in self._folders]
+        for line in end_lines(paths, seconds, self._seconds(), bool(num_episodes)) if is_main else ():
+            _log.info(line)
 
     def _start(self) -> tuple[TrainState, int]:
         """Initial or restored TrainState, and the number of completed calls."""
@@ -163,9 +178,15 @@ class Trainer:
         """Close the run folders. A run that stops early waits for its saves here, since no scoring follows."""
         state = _without_replay(state)
         for recorder, own in zip(self.recorders, self._program.split(state), strict=True):
-            recorder.end(own, call * self.steps_per_call)
+            evaluate = functools.partial(self._mean_return, recorder.config.seed)
+            recorder.end(own, call * self.steps_per_call, None if is_stopped else evaluate)
             if is_stopped:
                 recorder.wait()
+
+    def _mean_return(self, seed: int, policy_params: Any) -> float:
+        """Mean return of a policy over as many new episodes as an inline evaluation has."""
+        key = jax.random.fold_in(jax.random.PRNGKey(seed), _CLOSING_EVALUATION)
+        return float(self._evaluate(policy_params, key))
 
     def _rows(self, call: int, metrics: Metrics) -> list[Row]:
         of_runs = self._program.split_metrics(metrics)

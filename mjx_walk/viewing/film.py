@@ -16,6 +16,7 @@ from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config, save_config
 from mjx_walk.runs.policies import SavedPolicy
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.scores import FINAL
 from mjx_walk.runs.tensorboard import Summary, SummaryWriter
 from mjx_walk.utils.subprocesses import start_module
 from mjx_walk.viewing.episode import record_episode
@@ -49,7 +50,7 @@ class Filmer:
         film.path.mkdir(parents=True, exist_ok=True)
         save_config(self._config, film.config)
         params = jax.device_get(policy_params)
-        checkpoint.save(film.best_policy, params, {"env_steps": env_steps}, as_numpy=True)
+        checkpoint.save(film.policy(FINAL), params, {"env_steps": env_steps}, as_numpy=True)
         self._process = start_module("viewing.film", str(film.path), env={"JAX_PLATFORMS": "cpu"})
 
     def wait(self) -> None:
@@ -60,7 +61,7 @@ class Filmer:
 
 def film(folder: Path) -> None:
     """Film the policy saved in `films/ENV_STEPS`, and replace the folder with `films/ENV_STEPS.mp4`."""
-    run = SavedPolicy(RunFolder(folder), "c")
+    run = SavedPolicy(RunFolder(folder), "c", FINAL)
     episode = record_episode(run.task, run.policy, size=_SIZE, frame_rate=_FRAMES_PER_SECOND)
     write_film(episode.frames, folder.with_suffix(".mp4"), episode.frames_per_second)
     num_shown = round(_SECONDS_IN_TENSORBOARD * episode.frames_per_second)

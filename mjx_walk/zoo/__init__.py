@@ -1,14 +1,14 @@
 """Policies that the package ships, and their lookup: `run=zoo:humanoid-ppo` works wherever a run folder does.
 
-Each is a run folder with only its configuration, its policy in one file and its score in the real Gymnasium. Code that
-trains or scores policies does not belong here. `python -m mjx_walk.zoo` lists the policies.
+Each is a run folder with only its configuration, its best policy in one file and its score in the real Gymnasium. Code
+that trains or scores policies does not belong here. `python -m mjx_walk.zoo` lists the policies.
 """
 
-import json
 import shutil
 from pathlib import Path
 
 from mjx_walk.runs.run_folder import RunFolder, open_existing
+from mjx_walk.runs.scores import BEST, read_scores
 from mjx_walk.utils.errors import UserError
 
 PREFIX = "zoo:"
@@ -49,11 +49,16 @@ def holds(folder: Path) -> bool:
 
 def table() -> str:
     """All policies with their scores and the commands that trained them, in Markdown."""
-    lines = ["| run | score in Gymnasium | command |", "| --- | --- | --- |"]
+    lines = [
+        "| Run | Task | Score | Std over episodes | Best of runs | Mean of these runs | Command |",
+        "| --- | --- | ---: | ---: | ---: | ---: | --- |",
+    ]
     for name in names():
-        facts = json.loads(RunFolder(_FOLDER / name).gymnasium_scores.read_text())
-        score = f"{facts['env']}: {facts['mean']:,.0f} ± {facts['std']:,.0f}"
-        lines.append(f"| `{PREFIX}{name}` | {score} | `{facts['command']}` |")
+        scores = read_scores(RunFolder(_FOLDER / name).gymnasium_scores)
+        block, facts = scores.blocks[BEST], scores.facts
+        numbers = (block["mean"], block["std"], facts["num_runs"], facts["runs_mean"])
+        cells = [f"`{PREFIX}{name}`", scores.env, *(f"{number:,.0f}" for number in numbers), f"`{facts['command']}`"]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

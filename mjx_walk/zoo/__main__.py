@@ -10,19 +10,31 @@ from mjx_walk import zoo
 from mjx_walk.api import load_run
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import save_config, training_command
+from mjx_walk.runs.scores import BEST, write_scores
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import setting
 
 USAGE = """
-usage: python -m mjx_walk.zoo                          list the policies
-       python -m mjx_walk.zoo add=RUN_DIR name=NAME    score a run's policy and add it; for the package's authors
+usage: python -m mjx_walk.zoo
+       python -m mjx_walk.zoo add=RUN_DIR name=NAME [num_runs=1 runs_mean=SCORE]
+
+  The first form lists the policies. The second one, for the package's authors, scores a run's best policy on new
+  episodes and adds it.
+  num_runs    runs of which this one scored best
+  runs_mean   the mean score of these runs; by default this run's own
 """
+
+_FIRST_SEED = 10_000
+"""Of the 100 scored episodes. Nobody has chosen a policy, a seed or a recipe on them."""
 
 
 @dataclasses.dataclass
 class Arguments:
     add: str | None = None
     name: str | None = None
+    num_runs: int = setting(1, at_least=1)
+    runs_mean: float | None = None
 
 
 def main(command_line: list[str]) -> None:
@@ -37,13 +49,19 @@ def main(command_line: list[str]) -> None:
         raise UserError(f"name={arguments.name}: use only letters, digits, '_' and '-'")
     run = load_run(arguments.add, "auto")
     run.policy_params = _rounded_to(run.config.algo.network_dtype, run.policy_params)
-    scores = run.evaluate()
+    scores = run.evaluate(seed=_FIRST_SEED)
     folder = zoo.empty_folder(arguments.name)
     config = dataclasses.replace(run.config, physics="auto", run_dir=None, resume=False)
     save_config(config, folder.config)
-    facts = {"env_steps": run.policy_facts["env_steps"]}
-    checkpoint.save(folder.best_policy, run.policy_params, facts, as_numpy=True)
-    scores.save(folder.gymnasium_scores, command=training_command(config), **facts)
+    checkpoint.save(folder.policy(BEST), run.policy_params, run.policy_facts, as_numpy=True)
+    write_scores(
+        folder.gymnasium_scores,
+        scores.env,
+        {BEST: scores.block(**run.policy_facts)},
+        command=training_command(config),
+        num_runs=arguments.num_runs,
+        runs_mean=scores.mean if arguments.runs_mean is None else arguments.runs_mean,
+    )
     print(scores)
 
 

@@ -76,6 +76,8 @@ def test_critic_loss_is_the_cross_entropy_to_the_lower_critics_future():
     logs = np.asarray(log_distributions(state.critic, obs, action))
     expected = -(target[:, None] * logs).sum(axis=-1).mean(axis=0).sum()
     assert float(metrics["critic_loss"]) == pytest.approx(expected, rel=1e-4)
+    for name, mass in (("lowest", target[:, 0]), ("highest", target[:, -1])):
+        assert 0 < mass.mean() == pytest.approx(float(metrics[f"target_mass_{name}_atom"]), rel=1e-4)
 
 
 def test_returns_need_a_bound():

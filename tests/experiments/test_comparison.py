@@ -31,8 +31,8 @@ def fake_run(folder, overrides, returns, score=None):
     ]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     if score is not None:
-        content = json.dumps({"mean": score, "std": 1.0, "returns": [score]})
-        (folder / "eval_gymnasium.json").write_text(content)
+        blocks = {"final": {"mean": score, "std": 1.0}, "best": {"mean": score + 10.0, "std": 2.0}}
+        (folder / "eval_gymnasium.json").write_text(json.dumps({"env": "Walker2d-v5", **blocks}))
 
 
 def test_variants_are_the_product_of_algorithms_swept_values_and_seeds(tmp_path):
@@ -89,20 +89,33 @@ def test_runs_are_grouped_by_what_sets_them_apart(tmp_path):
         "ppo, discount=0.5": 2,
     }
     text = report.write_report(tmp_path).read_text()
-    assert "| ppo, discount=0.99 | 2 | 15 | 7 | – | – | 10 20 | 3.00 | 30 | 1 |" in text
-    assert "| ppo, discount=0.5 | 0 of 2 scored | – | – | – | – | – | 2.00 | 20 | 1 |" in text
+    assert "| ppo, discount=0.99 | final | 15 | 7 | – | – | – | 2 | 2 | 3.00 | 30 |" in text
+    assert "| ppo, discount=0.99 | best | 25 | 7 | – | – | – | 2 | 2 | 3.00 | 30 |" in text
+    assert "| ppo, discount=0.5 | final | – | – | – | – | – | 0 | 2 | 2.00 | 20 |" in text
+    assert "| ppo, discount=0.99 | 1 | 20 | 1 | 30 | 2 | 3.00 | 30 | 1 |" in text
     rows = list(csv.DictReader((tmp_path / "comparison.csv").open()))
-    assert len(rows) == 6 and {row["gymnasium_mean"] for row in rows} == {"10.0", "20.0", ""}
+    assert len(rows) == 6 and {row["final_mean"] for row in rows} == {"10.0", "20.0", ""}
+    assert {row["best_mean"] for row in rows} == {"20.0", "30.0", ""}
     assert (tmp_path / "comparison.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_scores_that_cannot_be_read_cost_the_comparison_nothing_else(tmp_path):
     for seed in (0, 1):
         fake_run(tmp_path / str(seed), ["env=walker2d", f"seed={seed}"], [1, 2], score=5.0)
-    (tmp_path / "0" / "eval_gymnasium.json").write_text('{"mean": 5')
-    with pytest.warns(UserWarning, match=r"eval_gymnasium\.json cannot be read: score the run again"):
-        runs = report.read_runs(tmp_path)
-    assert [run.scores and run.scores["mean"] for run in runs] == [None, 5.0]
+    for damaged in ('{"mean": 5', "[]", '{"final": 3}', "{}"):
+        (tmp_path / "0" / "eval_gymnasium.json").write_text(damaged)
+        with pytest.warns(UserWarning, match=r"eval_gymnasium\.json cannot be read: score the run again"):
+            runs = report.read_runs(tmp_path)
+        assert [run.score("final").get("mean") for run in runs] == [None, 5.0]
+
+
+def test_a_score_file_of_one_block_counts_as_the_best(tmp_path):
+    fake_run(tmp_path / "0", ["env=walker2d"], [1, 2])
+    content = {"env": "Walker2d-v5", "mean": 7.0, "std": 1.0, "returns": [7.0], "lengths": [3], "seeds": [0]}
+    (tmp_path / "0" / "eval_gymnasium.json").write_text(json.dumps(content | {"env_steps": 5, "wall_seconds": 2.0}))
+    (run,) = report.read_runs(tmp_path)
+    assert run.score("final") == {} and run.score("best")["mean"] == 7.0
+    assert run.scores.blocks["better"]["env_steps"] == 5 and run.scores.facts == {"wall_seconds": 2.0}
 
 
 def test_runs_of_different_environments_do_not_mix(tmp_path):
@@ -136,11 +149,11 @@ def test_compare_runs_what_is_missing_and_keeps_the_rest(tmp_path, monkeypatch, 
     arguments = ("seeds=1", "out=out", *SMALL)
     assert command_here("compare", "algos=[ppo]", *arguments) == 0
     printed = capfd.readouterr().out
-    assert "1 runs in out, 0 of them finished already" in printed and "| ppo | 1 |" in printed
+    assert "1 runs in out, 0 of them finished already" in printed and "| ppo | final |" in printed
     before = (tmp_path / "out" / "ppo" / "seed_0" / "metrics.jsonl").stat().st_mtime_ns
     assert command_here("compare", "algos=[ppo,a2c]", *arguments) == 0
     printed = capfd.readouterr().out
-    assert "2 runs in out, 1 of them finished already" in printed and "| a2c | 1 |" in printed
+    assert "2 runs in out, 1 of them finished already" in printed and "| a2c | final |" in printed
     assert (tmp_path / "out" / "ppo" / "seed_0" / "metrics.jsonl").stat().st_mtime_ns == before
 
 

@@ -1,4 +1,4 @@
-"""Which policy a run keeps."""
+"""Which policies a run keeps and scores."""
 
 import jax
 import jax.numpy as jnp
@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from mjx_walk.algos import make_algorithm
-from mjx_walk.evaluation.gymnasium_scores import Scores
+from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import load_config
-from mjx_walk.runs.policies import load_best_policy, make_task
+from mjx_walk.runs.policies import choose_policy, load_policy, make_task
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.scores import Scores, read_scores
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.recorder import Recorder
+from mjx_walk.utils.errors import UserError
 
 TINY = [
     *("env=walker2d", "algo=ppo", "hardware=cpu", "physics=c", "num_envs=2", "evaluation.num_envs=1"),
@@ -41,54 +43,115 @@ def with_best(algorithm, state, best_return, best_iteration):
     return state.replace(evaluation=evaluation), best
 
 
-def kept(folder, algorithm, state):
-    return load_best_policy(folder, algorithm.policy_params(state))
+def kept(folder, name, algorithm, state):
+    return load_policy(folder, name, algorithm.policy_params(state))
 
 
 def assert_same(found, expected):
     jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
-def test_the_best_policy_is_saved_once_evaluated_and_not_again_while_it_stays(run, monkeypatch):
+def test_the_final_and_the_best_policy_are_kept(run, monkeypatch):
     recorder, algorithm, state, folder = run
     recorder.save(state, env_steps=4, wall_seconds=1.0)
     recorder.wait()
-    params, facts = kept(folder, algorithm, state)
-    assert_same(params, algorithm.policy_params(state))  # none is known to be better yet
+    params, facts = kept(folder, "final", algorithm, state)
+    assert_same(params, algorithm.policy_params(state))
     assert facts["env_steps"] == 4
+    assert choose_policy(folder, "best") == "final"  # no evaluation has ended
 
     state, best = with_best(algorithm, state, best_return=3.0, best_iteration=5)
     recorder.save(state, env_steps=80, wall_seconds=2.0)
     recorder.wait()
-    params, facts = kept(folder, algorithm, state)
+    params, facts = kept(folder, choose_policy(folder, "best"), algorithm, state)
     assert_same(params, best)
     assert (facts["env_steps"], facts["eval_return"]) == (20, 3.0)
+    params, facts = kept(folder, "final", algorithm, state)
+    assert_same(params, algorithm.policy_params(state))
+    assert facts["env_steps"] == 80
 
     written = []
     monkeypatch.setattr(recorder._saver, "save", lambda *parts: written.append([path.name for path, _, _ in parts]))
     recorder.save(state, env_steps=84, wall_seconds=3.0)
     recorder.save(with_best(algorithm, state, 4.0, 6)[0], env_steps=88, wall_seconds=4.0)
-    assert [len(names) for names in written] == [1, 2] and written[1][0] == "best"
+    assert written == [["final", "0000000000084"], ["best", "final", "0000000000088"]]
 
 
-@pytest.mark.parametrize(("last", "best", "env_steps"), [(5.0, 9.0, 20), (9.0, 5.0, 80)])
-def test_of_the_last_policy_and_the_best_one_gymnasium_chooses(run, monkeypatch, last, best, env_steps):
-    """The last policy scores below the best one's inline evaluation of 10, so both are scored."""
+def test_a_folder_without_a_final_policy_says_so(run):
+    _, _, _, folder = run
+    with pytest.raises(UserError, match="holds no policy yet"):
+        choose_policy(folder, "final")
+    folder.policy("best").mkdir()
+    with pytest.raises(UserError, match="has kept only its best policy; choose policy=best"):
+        choose_policy(folder, "final")
+    with pytest.raises(UserError, match="policy=last: choose one of: final, best"):
+        choose_policy(folder, "last")
+
+
+@pytest.mark.parametrize(("final", "best"), [(5.0, 9.0), (9.0, 5.0)])
+def test_both_policies_are_scored_and_the_scores_choose_nothing(run, monkeypatch, final, best):
     recorder, algorithm, state, folder = run
     state, best_params = with_best(algorithm, state, best_return=10.0, best_iteration=5)
-    last_params = algorithm.policy_params(state)
+    acted = {}
 
-    def score(params, num_episodes):
-        is_best = float(jax.tree.leaves(params)[-1].ravel()[0]) == 7.0
-        return Scores(np.full(num_episodes, best if is_best else last), np.full(num_episodes, 3), [0], "Walker2d-v5")
+    def score(task, act, num_episodes):
+        acted[len(acted)] = np.asarray(act(np.ones(task.observation_size, np.float32)))
+        value = final if len(acted) == 1 else best
+        return Scores(np.full(num_episodes, value), np.full(num_episodes, 3), [0], task.gymnasium_id)
 
-    monkeypatch.setattr(recorder, "_score_in_gymnasium", score)
+    monkeypatch.setattr("mjx_walk.training.recorder.score_in_gymnasium", score)
     monkeypatch.setattr("mjx_walk.viewing.run_plots.plot_run", lambda folder: None)
     recorder.begin(0, will_train=True)
-    recorder.end(state, env_steps=80)
-    scores = recorder.score(wall_seconds=1.0)
+    recorder.end(state, env_steps=80, evaluate=lambda params: 9.5)  # less than the best one's 10
+    scored = recorder.score(wall_seconds=1.0)
+    assert {name: (scores.mean, steps) for name, (scores, steps) in scored.items()} == {
+        "final": (final, 80),
+        "best": (best, 20),
+    }
+    for index, params in enumerate((algorithm.policy_params(state), best_params)):
+        expected = algorithm.policy(params)(jnp.ones(17), jax.random.PRNGKey(0))
+        np.testing.assert_allclose(acted[index], expected, rtol=1e-5)
+    file = read_scores(folder.gymnasium_scores)
+    assert {name: (block["mean"], block["env_steps"]) for name, block in file.blocks.items()} == {
+        "final": (final, 80),
+        "best": (best, 20),
+    }
+    assert file.env == "Walker2d-v5" and file.facts["wall_seconds"] == 1.0
+
+
+def test_a_final_policy_with_the_highest_evaluation_is_also_the_best(run, monkeypatch):
+    recorder, algorithm, state, folder = run
+    state, _ = with_best(algorithm, state, best_return=10.0, best_iteration=5)
+    scored_policies = []
+
+    def score(task, act, num_episodes):
+        scored_policies.append(act)
+        return Scores(np.full(num_episodes, 4.0), np.full(num_episodes, 3), [0], task.gymnasium_id)
+
+    monkeypatch.setattr("mjx_walk.training.recorder.score_in_gymnasium", score)
+    monkeypatch.setattr("mjx_walk.viewing.run_plots.plot_run", lambda folder: None)
+    recorder.begin(0, will_train=True)
+    recorder.save(state, env_steps=80, wall_seconds=1.0)
+    recorder.end(state, env_steps=80, evaluate=lambda params: 10.5)
+    recorder.score(wall_seconds=1.0)
     recorder.wait()
-    params, facts = kept(folder, algorithm, state)
-    assert scores.mean == 9.0 and facts["env_steps"] == env_steps
-    assert_same(params, best_params if best > last else last_params)
-    assert f'"env_steps": {env_steps}' in folder.gymnasium_scores.read_text()
+    params, facts = kept(folder, "best", algorithm, state)
+    assert_same(params, algorithm.policy_params(state))
+    assert facts == {"env_steps": 80, "eval_return": 10.5} and len(scored_policies) == 1
+    blocks = read_scores(folder.gymnasium_scores).blocks
+    assert blocks["final"] == blocks["best"] and blocks["best"]["eval_return"] == 10.5
+
+
+def test_the_next_save_of_a_resumed_run_keeps_what_its_state_holds_as_the_best(run):
+    recorder, algorithm, state, folder = run
+    state, best = with_best(algorithm, state, best_return=10.0, best_iteration=5)
+    recorder.save(state, env_steps=80, wall_seconds=1.0)
+    recorder.wait()
+    checkpoint.save(folder.policy("best"), algorithm.policy_params(state), {"env_steps": 80, "eval_return": 10.5})
+    resumed = Recorder(recorder.config, make_task(recorder.config), algorithm, folder, Processes())
+    restored, _ = resumed.restore(state)
+    resumed.save(restored, env_steps=84, wall_seconds=2.0)
+    resumed.wait()
+    params, facts = kept(folder, "best", algorithm, state)
+    assert_same(params, best)
+    assert facts == {"env_steps": 20, "eval_return": 10.0}

@@ -1,7 +1,5 @@
 """The policies that come with the package."""
 
-import json
-
 import numpy as np
 import pytest
 from helpers import command, command_here
@@ -9,6 +7,7 @@ from helpers import command, command_here
 import mjx_walk
 from mjx_walk import zoo
 from mjx_walk.runs.config import flatten, load_config, read_config, training_command
+from mjx_walk.runs.scores import read_scores
 from mjx_walk.utils.settings import has_effect
 
 NAMES = zoo.names()
@@ -23,17 +22,20 @@ def test_three_tasks_and_the_main_algorithms_are_there():
 def test_a_policy_is_small_and_scores_about_what_it_did(name):
     folder = zoo.open_run(f"zoo:{name}")
     assert sum(path.stat().st_size for path in folder.path.rglob("*") if path.is_file()) < 1_000_000
-    facts = json.loads(folder.gymnasium_scores.read_text())
-    assert len(facts["returns"]) == 100 and np.mean(facts["returns"]) == pytest.approx(facts["mean"])
+    block = read_scores(folder.gymnasium_scores).blocks["best"]
+    assert block["seeds"] == list(range(10_000, 10_100)) and len(block["returns"]) == 100
+    assert np.mean(block["returns"]) == pytest.approx(block["mean"])
+    assert np.std(block["returns"], ddof=1) == pytest.approx(block["std"])
     run = mjx_walk.load_run(f"zoo:{name}")
-    assert run.evaluate(episodes=1).mean > 0.8 * facts["mean"]
+    scores = run.evaluate(episodes=1, seed=10_000)
+    assert scores.mean == pytest.approx(block["returns"][0], rel=0.2)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_its_command_gives_its_settings(name):
     folder = zoo.open_run(f"zoo:{name}")
     config = read_config(folder.config)
-    command = json.loads(folder.gymnasium_scores.read_text())["command"]
+    command = read_scores(folder.gymnasium_scores).facts["command"]
     assert command == training_command(config)
     words = command.split()
     assert words[:3] == ["python", "-m", "mjx_walk.train"]

@@ -1,0 +1,53 @@
+"""The last lines of a training: which policies were scored, the time it took, its folder, and the next command."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from mjx_walk.runs.scores import Scores
+
+__all__ = ["duration", "end_lines", "score_lines"]
+
+
+def score_lines(
+    scored: Mapping[str, tuple[Scores, int]], total_steps: int | None = None, seed: int | None = None
+) -> list[str]:
+    """One line for each scored policy.
+
+    Args:
+        scored: scores and environment steps of each policy, by its name.
+        total_steps: environment steps of the complete training.
+        seed: the run's seed, if several runs were trained together.
+    """
+    whose = "" if seed is None else f"seed {seed}, "
+    end = "" if total_steps is None else f" of {total_steps:,}"
+    lines = (f"{whose}{name} policy (step {steps:,}{end}), {scores}" for name, (scores, steps) in scored.items())
+    return [line[0].upper() + line[1:] for line in lines]
+
+
+def end_lines(folders: list[Path], training_seconds: float, total_seconds: float, is_scored: bool) -> list[str]:
+    """The time, the folder, and the next command.
+
+    Args:
+        folders: folders of the runs that were trained together.
+        training_seconds: seconds of training, without scoring.
+        total_seconds: seconds of training and scoring.
+        is_scored: whether the policies were scored.
+    """
+    time = duration(total_seconds)
+    if is_scored:
+        time = f"{time}, of which training took {duration(training_seconds)}"
+    where = str(folders[0]) if len(folders) == 1 else f"{len(folders)} folders of {folders[0].parent}"
+    next_step = (
+        "To watch the best policy: python -m mjx_walk.play" if is_scored else "To score: python -m mjx_walk.eval"
+    )
+    return [f"Finished in {time}. The results are in {where}", f"{next_step} run={folders[0]}"]
+
+
+def duration(seconds: float) -> str:
+    """Seconds as text: `48 s`, `4 min 41 s`, `1 h 2 min`."""
+    total = round(seconds)
+    if total < 60:
+        return f"{total} s"
+    if total < 3600:
+        return f"{total // 60} min {total % 60} s"
+    return f"{total // 3600} h {total % 3600 // 60} min"
