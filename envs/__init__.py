@@ -9,11 +9,12 @@ if __name__ != "mjx_walk.envs":  # a second import under another name would dupl
 
 import dataclasses
 import difflib
+from pathlib import Path
 from typing import Any
 
 from mjx_walk.envs.humanoid import Humanoid, HumanoidOptions
 from mjx_walk.envs.humanoid_standup import HumanoidStandup, HumanoidStandupOptions
-from mjx_walk.envs.task import NO_TIME_LIMIT, State, Task, TaskOptions, TrainableTask
+from mjx_walk.envs.task import NO_TIME_LIMIT, State, Task, TaskOptions, TrainableTask, with_absolute_paths
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.utils.compat import prepare_jax
 from mjx_walk.utils.errors import UserError
@@ -25,7 +26,7 @@ TASKS: dict[str, tuple[type[Task], type[TaskOptions]]] = {
     "walker2d": (Walker2d, Walker2dOptions),
 }
 
-__all__ = ["NO_TIME_LIMIT", "TASKS", "State", "Task", "TaskOptions", "TrainableTask", "make_env"]
+__all__ = ["NO_TIME_LIMIT", "TASKS", "State", "Task", "TaskOptions", "TrainableTask", "make_env", "with_absolute_paths"]
 
 
 def make_env(name: str, physics: str = "auto", **kwargs: Any) -> Task:
@@ -50,6 +51,6 @@ def make_env(name: str, physics: str = "auto", **kwargs: Any) -> Task:
             near = difflib.get_close_matches(option, known, n=1)
             hint = f"did you mean '{near[0]}'? " if near else ""
             raise UserError(f"{name} has no option '{option}'; {hint}valid: {', '.join(known)}")
-    options = options_class(**kwargs)
+    options = with_absolute_paths(options_class(**kwargs), Path.cwd())
     validate(options)
     return task_class(options, physics)

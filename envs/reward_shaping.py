@@ -1,9 +1,7 @@
 """Reward shaping and custom reward functions, for training only: scores in Gymnasium use Gymnasium's reward."""
 
 import dataclasses
-import importlib.util
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -71,38 +69,6 @@ def shaping_terms(shaping: Shaping, step: RewardStep) -> Terms:
         speed = (step.after.qpos[0] - step.before.qpos[0]) / step.dt
         terms["reward_backward"] = shaping.backward * jnp.minimum(speed, 0.0)
     return terms
-
-
-def reward_file(source: str) -> Path:
-    """Path of the file in `PATH.py:FUNCTION`."""
-    return Path(source.rpartition(":")[0]).expanduser()
-
-
-def load_reward_function(source: str) -> RewardFunction:
-    """Load a reward function from a Python file.
-
-    Args:
-        source: `PATH.py:FUNCTION`.
-
-    Raises:
-        UserError: the file or the function does not exist, or the file raises an exception.
-    """
-    path, name = reward_file(source), source.rpartition(":")[2]
-    problem = f"env.reward_function={source}: "
-    if not path.is_file():
-        raise UserError(f"{problem}no file '{path if path.name else source}'; write PATH.py:FUNCTION")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None:
-        raise UserError(f"{problem}'{path}' is not a Python file; write PATH.py:FUNCTION")
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise UserError(f"{problem}{type(error).__name__}: {error}") from error
-    function = vars(module).get(name)
-    if not callable(function):
-        raise UserError(f"{problem}'{path}' has no function '{name}'")
-    return function
 
 
 def term_names(function: RewardFunction, source: str, example: RewardStep, shaped: Terms) -> tuple[str, ...]:

@@ -15,7 +15,8 @@ from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
-from mjx_walk.envs.reward_shaping import RewardStep, Shaping, Terms, load_reward_function, shaping_terms, term_names
+from mjx_walk.envs.reward_files import absolute_source, load_reward_function
+from mjx_walk.envs.reward_shaping import RewardStep, Shaping, Terms, shaping_terms, term_names
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
 
@@ -87,11 +88,11 @@ class TaskOptions:
     name: str = ""
     version: str = setting("v5", choices=("v5", "v4"))
     xml_file: str | None = None
-    """Model file, resolved as in Gymnasium. Default: the version's own model."""
+    """Model file: a path, or the name of one of Gymnasium's assets. Default: the version's own model."""
     frame_skip: int = setting(5, at_least=1)
     reset_noise_scale: float = setting(1e-2, at_least=0)
     exclude_current_positions_from_observation: bool = True
-    max_episode_steps: int = setting(1000, at_least=1)
+    max_episode_steps: int = setting(1000, at_least=1, at_most=NO_TIME_LIMIT)
     shaping: Shaping = dataclasses.field(default_factory=Shaping)
     """Weights of additional reward terms."""
     reward_function: str | None = None
@@ -101,9 +102,6 @@ class TaskOptions:
         for name, value in list(vars(self).items()):
             if isinstance(value, list):  # a configuration file gives a range as a list
                 setattr(self, name, tuple(value))
-        if self.xml_file and _model_path(self.xml_file).is_file():
-            # An absolute path stays valid when a run is loaded from another working directory.
-            self.xml_file = str(_model_path(self.xml_file).resolve())
         if isinstance(self.shaping, dict):
             unknown = self.shaping.keys() - {field.name for field in dataclasses.fields(Shaping)}
             if unknown:
@@ -180,6 +178,11 @@ class Task(TrainableTask, abc.ABC):
     def gymnasium_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of `gymnasium.make` for the equivalent environment, without those at their default."""
         return {name: value for name, value in self.options.changed().items() if name not in _NOT_IN_GYMNASIUM}
+
+    @property
+    def reward_hashes(self) -> dict[str, str]:
+        """SHA-256 of the reward function's files, by absolute path; empty without a reward function."""
+        return self._reward_function.hashes if self._reward_function else {}
 
     @property
     def has_custom_reward(self) -> bool:
@@ -334,11 +337,25 @@ def _is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[
 
 
 def _model_path(xml_file: str) -> Path:
-    """Path of a model by the rules of Gymnasium's `xml_file`: a bare name is an asset of Gymnasium."""
+    """Path of a model. A bare name is one of Gymnasium's assets, even if the working directory has such a file."""
     path = Path(xml_file).expanduser()
-    if len(path.parts) == 1 and not path.exists():
+    if len(path.parts) == 1:
         return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / xml_file
     return path
+
+
+def with_absolute_paths(options: TaskOptions, folder: Path) -> TaskOptions:
+    """Options whose files stay the same ones when a run is loaded from another working directory.
+
+    Args:
+        options: env options as a user gives them.
+        folder: what a relative path is relative to.
+    """
+    xml_file, source = options.xml_file, options.reward_function
+    if xml_file and (folder / Path(xml_file).expanduser()).is_file():
+        xml_file = str((folder / Path(xml_file).expanduser()).resolve())
+    source = absolute_source(source, folder) if source else source
+    return dataclasses.replace(options, xml_file=xml_file, reward_function=source)
 
 
 def load_model(xml_file: str) -> mujoco.MjModel:

@@ -15,6 +15,7 @@ from mjx_walk import zoo
 from mjx_walk.algos import make_algorithm
 from mjx_walk.envs import Task
 from mjx_walk.envs.physics import resolve_engine
+from mjx_walk.envs.reward_files import only_known, reward_path
 from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium, score_in_sim
 from mjx_walk.runs import run_folder
 from mjx_walk.runs.config import Config, load_config, present_key, read_config
@@ -23,6 +24,7 @@ from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.policies import SavedPolicy, make_task
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.scores import BEST, Scores
+from mjx_walk.runs.trust import remember, require_trusted
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.memory_check import check_replay
 from mjx_walk.training.trainer import Trainer
@@ -127,6 +129,8 @@ def train(
     processes = processes or Processes()
     with temporary_jax_settings(configs[0].matmul_precision):
         task = make_task(configs[0])
+        if task.reward_hashes and processes.is_main_process:
+            remember(configs[0].env.reward_function, task.reward_hashes)
         folders, configs = _prepare(configs, task, processes)
         trainer = Trainer(configs, task, folders, on_metrics, processes)
         with as_by_ctrl_c():
@@ -165,12 +169,12 @@ def _score(trainer: Trainer, folders: list[RunFolder]) -> None:
 
 
 def _resume_command(configs: list[Config], folders: list[RunFolder]) -> str:
-    where = f"run_dir={folders[0].path}"
+    where = shlex.quote(f"run_dir={folders[0].path}")
     if len(folders) > 1:
-        where = f"run_dir={folders[0].path.parent} 'seeds={[config.seed for config in configs]}'"
-    source = configs[0].env.reward_function
-    reward = f" {shlex.quote(f'env.reward_function={source}')}" if source else ""
-    return f"python -m mjx_walk.train {where} resume=true{reward}"
+        where = f"{shlex.quote(f'run_dir={folders[0].path.parent}')} 'seeds={[config.seed for config in configs]}'"
+    named = {"env.reward_function": configs[0].env.reward_function, "wandb_project": configs[0].wandb_project}
+    again = "".join(f" {shlex.quote(f'{key}={value}')}" for key, value in named.items() if value)
+    return f"python -m mjx_walk.train {where} resume=true{again}"
 
 
 def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | None = None) -> Run:
@@ -194,15 +198,22 @@ def _as_saved(config: Config, overrides: list[str]) -> Config:
     """The saved configuration with the given settings, if a run is resumed without naming its task or algorithm.
 
     Raises:
-        UserError: the saved run has a reward function, and the overrides do not name it. A folder must not run code.
+        UserError: the saved run has a reward function that neither the overrides name nor the user has named before,
+            or logs to Weights & Biases, and the overrides do not say so. A folder must not run code or upload.
     """
+    if config.env.reward_function:
+        only_known(reward_path(config.env.reward_function), None)
     given = {present_key(override.partition("=")[0]) for override in overrides}
     if not (config.resume and config.run_dir) or given & {"env", "algo", "recipe"}:
         return config
     saved = read_config(run_folder.open_existing(config.run_dir).config)
     source = saved.env.reward_function
     if source and "env.reward_function" not in given:
-        raise UserError(f"the saved run uses the code of {source}; to run it, add env.reward_function={source}")
+        require_trusted(source)
+    project = saved.wandb_project
+    if project and "wandb_project" not in given:
+        named = shlex.quote(f"wandb_project={project}")
+        raise UserError(f"the saved run logs to Weights & Biases; to go on, add {named}, or wandb_project=null")
     for key in given - {"hardware"} | {"run_dir", "resume"}:
         saved = _with_setting(saved, key, operator.attrgetter(key)(config))
     return saved

@@ -15,6 +15,7 @@ from mjx_walk.runs.policies import make_task
 from mjx_walk.training import launcher
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import write_text
 from mjx_walk.utils.settings import setting
 from mjx_walk.utils.versions import package_versions
 
@@ -70,7 +71,7 @@ def main(command_line: list[str]) -> None:
         print(f"  {name:<44} {value:>12,.1f} {unit}", flush=True)
     if arguments.out:
         content = {"env": task.gymnasium_id, "device": device, "results": results, "versions": package_versions()}
-        Path(arguments.out).write_text(json.dumps(content, indent=1))
+        write_text(Path(arguments.out), json.dumps(content, indent=1))
 
 
 def device_counts(asked: Any) -> list[int]:

@@ -8,6 +8,7 @@ from mjx_walk.api import load_run
 from mjx_walk.runs.scores import BEST, POLICIES
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import replacing
 from mjx_walk.utils.settings import setting
 
 USAGE = """
@@ -43,7 +44,8 @@ def main(command_line: list[str]) -> None:
     path = Path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.onnx")
     cli.check_writable(path)
     model = translate(run.act, run.task.observation_size, f"{run.config.env.name}_{run.config.algo.name}")
-    onnx.save(model, str(path))
+    with replacing(path) as new:
+        onnx.save(model, str(new))
     print(f"{path}: observation [N, {run.task.observation_size}] → action [N, {run.task.action_size}]")
 
 

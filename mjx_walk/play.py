@@ -9,6 +9,7 @@ from mjx_walk import zoo
 from mjx_walk.api import load_run
 from mjx_walk.runs.scores import BEST, POLICIES
 from mjx_walk.utils import cli
+from mjx_walk.utils.files import replacing
 from mjx_walk.utils.settings import setting
 from mjx_walk.viewing.episode import record_episode
 from mjx_walk.viewing.gait import draw_gait_sheet, frame_strip
@@ -76,7 +77,8 @@ def main(command_line: list[str]) -> None:
         if gait:
             draw_gait_sheet(episode, gait)
         if strip:
-            iio.imwrite(strip, frame_strip(episode, arguments.start, arguments.seconds))
+            with replacing(strip) as new:
+                iio.imwrite(new, frame_strip(episode, arguments.start, arguments.seconds))
         print(*written, sep="\n")
     if arguments.viewer:
         show(run.task, run.policy, arguments.seed)

@@ -4,6 +4,7 @@ import dataclasses
 import os
 import sys
 import traceback
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -23,6 +24,7 @@ from mjx_walk.runs.config import (
     present_overrides,
     register_schemas,
     to_config,
+    with_absolute_paths,
 )
 from mjx_walk.training import launcher
 from mjx_walk.training.distributed import Processes, join_processes
@@ -143,10 +145,10 @@ def _sweep_job(node: DictConfig) -> None:
     Raises:
         Stopped: a signal stopped the run. It ends the remaining jobs as well.
     """
-    if node.run_dir is None:
-        with open_dict(node):
-            node.run_dir = HydraConfig.get().runtime.output_dir
-    config = to_config(node)
+    runtime = HydraConfig.get().runtime  # with hydra.job.chdir=true this job has another working directory
+    with open_dict(node):
+        node.run_dir = os.path.join(runtime.cwd, node.run_dir or runtime.output_dir)
+    config = with_absolute_paths(to_config(node), Path(runtime.cwd))
     if not config.resume:
         refuse_ineffective(config, (o.partition("=")[0] for o in HydraConfig.get().overrides.task))
     _, signal_name = train([config])

@@ -11,6 +11,7 @@ import tempfile
 os.environ["JAX_PLATFORMS"] = "cpu"
 _QUICK_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 _SAFE_REDUCTIONS = "--xla_cpu_experimental_ynn_fusion_type=-reduce"
+os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="mjx_walk_config_")
 _FLAGS = os.environ.get("XLA_FLAGS", "")
 if _QUICK_COMPILE not in _FLAGS:  # pytest-xdist's workers inherit the flags
     os.environ["XLA_FLAGS"] = f"{_QUICK_COMPILE} {_SAFE_REDUCTIONS} {_FLAGS}".rstrip()

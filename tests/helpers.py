@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
@@ -123,10 +124,20 @@ def command_here(module: str, *arguments: str) -> int:
 
 
 def leaves(run_dir, call):
-    with ocp.PyTreeCheckpointer() as checkpointer:
-        path = checkpoint.step_path(run_dir / "checkpoints", call * TINY_CALL)
-        parts = [checkpointer.restore(part) for part in (path / "arrays", path / "replay") if part.exists()]
-    return {name: leaf for part in parts for name, leaf in part.items()}
+    return saved_leaves(checkpoint.step_path(run_dir / "checkpoints", call * TINY_CALL))
+
+
+def saved_leaves(path):
+    """All leaves of a checkpoint, read without the package."""
+    found = {}
+    for part in (path / "arrays", path / "replay"):
+        if (part / "arrays.npz").exists():
+            with np.load(part / "arrays.npz") as arrays:
+                found |= dict(arrays)
+        elif part.exists():
+            with ocp.PyTreeCheckpointer() as checkpointer:
+                found |= checkpointer.restore(part)
+    return found
 
 
 def train_here(run_dir, *arguments, tiny=TINY):
@@ -144,7 +155,7 @@ def train(run_dir, *arguments, tiny=TINY):
 
 def flip_a_byte(folder):
     """Damage the largest data file."""
-    path = max((p for p in (folder / "arrays").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    path = max((folder / "arrays" / "d").iterdir(), key=lambda p: p.stat().st_size)
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(data)

@@ -58,7 +58,7 @@ CASES = [
         "above algo.max_tail_discount=0.2; lengthen it, or lower algo.discount",
     ),
     (["algo=a2c", "algo.min_log_std=3"], "algo.min_log_std=3.0 is above algo.max_log_std=2.0"),
-    (["env.reward_function=mine.py:f"], "no file 'mine.py'; write PATH.py:FUNCTION"),
+    (["env.reward_function=mine.py:f"], "mine.py'; write PATH.py:FUNCTION"),
     (["env.reward_function=f"], "env.reward_function=f: no file 'f'; write PATH.py:FUNCTION"),
     (["env.shaping.faling=1"], "unknown key 'env.shaping.faling'; did you mean: env.shaping.falling"),
     (["algo=td3", "algo.policy_delay=3"], "must be a multiple of algo.policy_delay=3"),

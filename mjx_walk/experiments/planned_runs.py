@@ -23,6 +23,7 @@ from mjx_walk.runs.metrics import read_rows
 from mjx_walk.runs.run_folder import RunFolder, differences
 from mjx_walk.utils.devices import only_device
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import open_to_append
 from mjx_walk.utils.signals import Interrupt
 from mjx_walk.utils.subprocesses import start_module
 
@@ -190,7 +191,7 @@ def start_job(job: list[PlannedRun], log: Path, device: int | None, share: int, 
     if is_resumed:
         arguments.append("resume=true")
     log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("a") as file:
+    with os.fdopen(open_to_append(log), "a") as file:
         return start_module("train", *arguments, env=env, stdout=file, stderr=subprocess.STDOUT, pass_fds=(lock,))
 
 
@@ -259,7 +260,7 @@ def _lock(folder: Path) -> Iterator[int]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / "lock").open("w")
+        file = os.fdopen(open_to_append(folder / "lock"), "a")
     except OSError as error:
         raise UserError(f"cannot write to {folder}: {error.strerror}") from error
     with file:

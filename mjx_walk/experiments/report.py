@@ -12,9 +12,10 @@ import scipy.stats
 
 from mjx_walk.runs.config import Config, flatten, read_config
 from mjx_walk.runs.metrics import Row, read_rows, write_csv
-from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.run_folder import RunFolder, open_existing
 from mjx_walk.runs.scores import BEST, BETTER, FINAL, ScoreFile, read_scores
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import replacing, write_text
 from mjx_walk.viewing.run_plots import learning_axes, series
 
 MIN_SEEDS_FOR_INTERVALS = 3
@@ -45,11 +46,11 @@ def read_runs(folder: Path) -> list[LoggedRun]:
     """Read all runs below a folder that have logged something.
 
     Raises:
-        UserError: there are none, or they are of different environments.
+        UserError: there are none, they are of different environments, or one holds links or pipes.
     """
     runs = []
     for path in sorted(folder.rglob("config.yaml")):
-        run = RunFolder(path.parent)
+        run = open_existing(path.parent)
         rows = read_rows(run.metrics)
         if rows:
             runs.append(LoggedRun(read_config(path), rows, _scores(run)))
@@ -135,7 +136,7 @@ def write_report(folder: Path) -> Path:
     try:
         _draw(groups, folder / "comparison.png")
         write_csv([_csv_row(name, run) for name, runs in groups.items() for run in runs], folder / "comparison.csv")
-        path.write_text(_markdown(groups))
+        write_text(path, _markdown(groups))
     except OSError as error:
         raise UserError(f"cannot write to '{folder}': {error.strerror}") from error
     return path
@@ -154,7 +155,7 @@ def _draw(groups: dict[str, list[LoggedRun]], path: Path) -> None:
             for curve in curves:
                 axes.plot(*curve, color=color, alpha=0.35, linewidth=0.8)
             x, mean, values = mean_curve(curves)
-            axes.plot(x, mean, color=color, linewidth=2.2, label=f"{name} ({len(curves)})")
+            axes.plot(x, mean, color=color, linewidth=2.2, label=f"{name} ({len(curves)})".replace("$", r"\$"))
             bounds = interval(values)
             if bounds:
                 axes.fill_between(x, *bounds, color=color, alpha=0.2, linewidth=0)
@@ -164,7 +165,8 @@ def _draw(groups: dict[str, list[LoggedRun]], path: Path) -> None:
     if handles:
         num_columns = max(160 // (len(max(labels, key=len)) + 8), 1)  # as many as fit the figure's width
         figure.legend(handles, labels, loc="outside lower center", ncols=num_columns, fontsize=9)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as new:
+        figure.savefig(new, dpi=110)
 
 
 def _markdown(groups: dict[str, list[LoggedRun]]) -> str:

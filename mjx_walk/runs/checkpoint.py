@@ -4,12 +4,13 @@ Orbax's CheckpointManager treats all parts of a step alike and synchronizes all 
 newest step keeps its replay buffer, and each process writes its own folder.
 """
 
+import contextlib
 import json
 import os
 import shutil
 import warnings
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
 
+from mjx_walk.runs.arrays import HostArrays, read_arrays, write_arrays
+from mjx_walk.runs.facts import read_facts
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import fresh_name, write_text
 from mjx_walk.utils.versions import __version__
 
 FORMAT = 1
@@ -27,8 +30,8 @@ FORMAT = 1
 
 _META = "meta.json"
 _ARRAYS = "arrays"
-_NUMPY = "arrays.npz"
-"""File that replaces Orbax's folder for small pytrees and in processes other than the main one."""
+_UNFINISHED = ".unfinished"
+"""Suffix of folders that a save has not completed, or has replaced."""
 _REPLAY = "replay"
 """Field of the TrainState that only the newest checkpoint keeps, and the name of its folder."""
 
@@ -41,9 +44,6 @@ _RENAMED_LEAVES = {
     "noise": "exploration",
 }
 """Present paths of leaves, by the former paths in older checkpoints."""
-
-HostArrays = dict[str, np.ndarray]
-"""Host copies of a pytree's leaves, by path."""
 
 
 def to_host(tree: Any) -> HostArrays:
@@ -66,20 +66,13 @@ def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False) ->
         "mjx_walk": __version__,
         "crc32": {name: _crc32(x) for name, x in arrays.items()},
     }
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir(parents=True)
     replay = {name: x for name, x in arrays.items() if _is_replay(name)}
-    _write(unfinished / _ARRAYS, {name: x for name, x in arrays.items() if name not in replay}, as_numpy)
-    if replay:
-        _write(unfinished / _REPLAY, replay, as_numpy)
-    (unfinished / _META).write_text(json.dumps(meta))
-    former = path.with_name(f".{path.name}.former")
-    shutil.rmtree(former, ignore_errors=True)
-    if path.exists():
-        os.replace(path, former)  # atomic, unlike removing a folder
-    os.replace(unfinished, path)
-    shutil.rmtree(former, ignore_errors=True)
+    with _replacing_folder(path) as unfinished:
+        rest = {name: x for name, x in arrays.items() if name not in replay}
+        write_arrays(unfinished / _ARRAYS, rest, as_numpy)
+        if replay:
+            write_arrays(unfinished / _REPLAY, replay, as_numpy)
+        write_text(unfinished / _META, json.dumps(meta))
 
 
 def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
@@ -105,25 +98,20 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
         )
     wanted = _named_leaves(like)
     meta["crc32"] = {present_name(name): crc for name, crc in meta["crc32"].items()}
-    arrays = _read(path / _ARRAYS)
+    arrays = read_arrays(path / _ARRAYS, wanted, present_name)
     if any(_is_replay(name) for name in meta["crc32"]):
         if (path / _REPLAY).exists():
-            arrays |= _read(path / _REPLAY)
+            arrays |= read_arrays(path / _REPLAY, wanted, present_name)
         else:
             warnings.warn(f"{path} has no replay buffer; training refills it before learning continues", stacklevel=2)
             arrays |= {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in wanted.items() if _is_replay(name)}
             meta["crc32"] = {name: crc for name, crc in meta["crc32"].items() if not _is_replay(name)}
     for name, leaf in wanted.items():
-        if name in arrays and arrays[name].dtype.kind == "V":  # NumPy's files do not support bfloat16
-            arrays[name] = arrays[name].view(leaf.dtype)
-    for name, crc in meta["crc32"].items():
-        if name not in arrays or _crc32(arrays[name]) != crc:
+        if name in meta["crc32"] and (name not in arrays or _crc32(arrays[name]) != meta["crc32"][name]):
             raise ValueError(f"{path} is damaged: {name} does not match its checksum")
-    for name, leaf in wanted.items():
-        if name not in arrays or arrays[name].shape != leaf.shape or arrays[name].dtype != leaf.dtype:
-            found = f"{arrays[name].shape} {arrays[name].dtype}" if name in arrays else "nothing"
+        if name not in arrays:
             raise UserError(
-                f"{path} belongs to another run or version: {name} should be {leaf.shape} {leaf.dtype}, found {found}"
+                f"{path} belongs to another run or version: {name} should be {leaf.shape} {leaf.dtype}, found nothing"
             )
     leaves = [jnp.asarray(arrays[name]) for name in wanted]
     return jax.tree.unflatten(jax.tree.structure(like), leaves), meta
@@ -141,12 +129,9 @@ def read_meta(path: Path) -> dict[str, Any]:
     """Facts stored with a checkpoint.
 
     Raises:
-        ValueError: the folder is damaged.
+        ValueError: the folder is damaged, or a fact is not what it should be.
     """
-    try:
-        return json.loads((path / _META).read_text())
-    except (OSError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+    return read_facts(path / _META)
 
 
 def list_steps(folder: Path) -> list[Path]:
@@ -189,18 +174,22 @@ def restore_newest(
     raise UserError(f"no usable checkpoint in {folder}; start a new run without resume=true")
 
 
-def prune(folder: Path, keep: int) -> None:
+def prune(folder: Path, keep: int, newest: str | None = None) -> None:
     """Remove old checkpoints, old replay buffers and unfinished saves.
 
     Args:
         folder: folder of the checkpoints.
         keep: number of newest checkpoints to keep. Only the newest keeps its replay buffer.
+        newest: name of the checkpoint just saved. Later ones are removed: the run has resumed from before them.
     """
+    for path in list_steps(folder):
+        if newest and path.name > newest:
+            shutil.rmtree(path)
     for path in list_steps(folder)[:-keep]:
         shutil.rmtree(path)
     for path in list_steps(folder)[:-1]:
         shutil.rmtree(path / _REPLAY, ignore_errors=True)
-    for path in folder.glob(".*.unfinished"):
+    for path in folder.glob(f".*{_UNFINISHED}"):
         shutil.rmtree(path)
 
 
@@ -241,44 +230,31 @@ class BackgroundSaver:
     def _save(self, parts: list[tuple[Path, HostArrays, dict[str, Any]]]) -> None:
         for path, arrays, meta in parts:
             save(path, arrays, meta)
-        prune(self._folder, self._keep)
+        prune(self._folder, self._keep, max((path.name for path, *_ in parts if path.name.isdigit()), default=None))
+
+
+@contextlib.contextmanager
+def _replacing_folder(path: Path) -> Iterator[Path]:
+    """Context manager for writing a folder under a fresh name. On success it replaces `path`, else it is removed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished, former = (fresh_name(path.with_suffix(_UNFINISHED)) for _ in range(2))
+    unfinished.mkdir()
+    try:
+        yield unfinished
+        if path.exists():
+            os.replace(path, former)  # atomic, unlike removing a folder
+        os.replace(unfinished, path)
+    except BaseException:
+        if former.exists():
+            os.replace(former, path)
+        raise
+    finally:
+        shutil.rmtree(former, ignore_errors=True)
+        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def _is_replay(name: str) -> bool:
     return name.startswith(f"{_REPLAY}.")
-
-
-def _write(path: Path, arrays: HostArrays, as_numpy: bool) -> None:
-    if as_numpy or jax.process_index():  # Orbax writes host arrays only from the main process
-        path.mkdir()
-        write = np.savez_compressed if as_numpy else np.savez
-        write(path / _NUMPY, allow_pickle=False, **arrays)
-        return
-    with _checkpointer() as checkpointer:
-        checkpointer.save(path.absolute(), arrays)
-
-
-def _read(path: Path) -> HostArrays:
-    try:
-        if (path / _NUMPY).exists():
-            with np.load(path / _NUMPY) as arrays:
-                found = dict(arrays)
-        else:
-            with _checkpointer() as checkpointer:
-                found = checkpointer.restore(path.absolute())
-    except Exception as error:  # Orbax reports damage with many exception types
-        raise ValueError(f"{path} is damaged: {str(error).splitlines()[0][:200]}") from error
-    return {present_name(name): array for name, array in found.items()}
-
-
-def _checkpointer() -> ocp.Checkpointer:
-    """Orbax's checkpointer for this process alone. By default, Orbax waits for all processes."""
-    options = ocp.options.MultiprocessingOptions()
-    if jax.process_count() > 1:
-        rank = jax.process_index()
-        options = ocp.options.MultiprocessingOptions(rank, {rank}, f"process_{rank}")
-    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=options)
-    return ocp.Checkpointer(handler, multiprocessing_options=options)
 
 
 def _crc32(array: np.ndarray) -> int:

@@ -18,11 +18,14 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from mjx_walk import envs
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import ENGINES
+from mjx_walk.runs.saved_yaml import read_yaml
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import write_text
 from mjx_walk.utils.settings import has_effect, refuse_ineffective, setting, validate
 
 __all__ = [
@@ -41,6 +44,7 @@ __all__ = [
     "save_config",
     "to_config",
     "training_command",
+    "with_absolute_paths",
 ]
 
 _RENAMED = {
@@ -85,7 +89,7 @@ class Config:
     physics: str = setting("auto", choices=("auto", *ENGINES))
     """Physics engine, see `mjx_walk.envs.physics`."""
     seed: int = setting(0, at_least=0, at_most=2**32 - 1)
-    num_envs: int = setting(8192, at_least=1)
+    num_envs: int = setting(8192, at_least=1, at_most=2**31 - 1)
     """Training environments on each device."""
     total_steps: int = setting(100_000_000, at_least=1)
     """Environment steps, summed over all environments and rounded up to a multiple of the steps of a call."""
@@ -146,7 +150,7 @@ def compose_config(overrides: list[str]) -> Config:
     try:
         with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
             node = compose("train", overrides)
-        return to_config(node)
+        return with_absolute_paths(to_config(node), Path.cwd())
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(_one_line(error, overrides)) from error
 
@@ -161,6 +165,16 @@ def to_config(node: Any) -> Config:
     assert isinstance(config, Config)
     validate(config)
     return config
+
+
+def with_absolute_paths(config: Config, folder: Path) -> Config:
+    """A configuration whose files stay the same ones when the run is resumed from another working directory.
+
+    Args:
+        config: as a user gives it.
+        folder: what a relative path is relative to.
+    """
+    return dataclasses.replace(config, env=envs.with_absolute_paths(config.env, folder))
 
 
 def complete_overrides(overrides: list[str]) -> list[str]:
@@ -230,7 +244,7 @@ def flatten(config: Config) -> dict[str, Any]:
 
 def save_config(config: Config, path: Path) -> None:
     """Write a configuration as YAML."""
-    path.write_text(OmegaConf.to_yaml(OmegaConf.structured(config)))
+    write_text(path, OmegaConf.to_yaml(OmegaConf.structured(config)))
 
 
 def read_config(path: Path) -> Config:
@@ -240,14 +254,19 @@ def read_config(path: Path) -> Config:
         UserError: the file is not a configuration that this version reads.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-        if "${" in text:  # would be resolved, to the value of an environment variable for instance
-            raise UserError(f"{path} contains '${{', which no saved configuration does; write the value itself")
-        saved = _under_present_names(OmegaConf.create(text))
+        saved = _under_present_names(read_yaml(path))
         schema = OmegaConf.structured(Config(env=TASKS[saved.env.name][1](), algo=ALGORITHMS[saved.algo.name][1]()))
         return to_config(OmegaConf.merge(schema, saved))
-    except (KeyError, AttributeError, UnicodeDecodeError, yaml.YAMLError, OmegaConfBaseException) as error:
+    except UserError:
+        raise
+    except _UNREADABLE as error:
         raise UserError(f"{path} is not a configuration of this version: {_first_line(error)}") from error
+
+
+_UNREADABLE = (
+    *(LookupError, AttributeError, TypeError, ValueError, RecursionError),
+    *(yaml.YAMLError, OmegaConfBaseException),
+)
 
 
 def _under_present_names(saved: Any) -> Any:

@@ -4,6 +4,8 @@ import importlib.util
 import json
 import logging
 import math
+import os
+import re
 import secrets
 import sys
 import time
@@ -17,6 +19,7 @@ from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.tensorboard import SummaryWriter
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import open_to_append, write_text
 
 __all__ = ["MetricsWriter", "Progress", "WandbLog", "require_wandb"]
 
@@ -37,8 +40,8 @@ class MetricsWriter:
         path = run_dir / "metrics.jsonl"
         if resume_steps is not None:
             rows = [row for row in read_rows(path) if row["env_steps"] <= resume_steps]
-            path.write_text("".join(json.dumps(row) + "\n" for row in rows))
-        self._file = path.open("a", buffering=1)
+            write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
+        self._file = os.fdopen(open_to_append(path), "a", buffering=1)
         self._events = SummaryWriter(
             str(run_dir), flush_secs=30, purge_step=None if resume_steps is None else resume_steps + 1
         )
@@ -87,12 +90,15 @@ class WandbLog:
         """
         import wandb
 
-        identity = folder.path / "wandb_id.txt"
-        if not identity.exists():
-            identity.write_text(secrets.token_hex(4))
+        file = folder.path / "wandb_id.txt"
+        if not file.exists():
+            write_text(file, secrets.token_hex(4))
+        identity = file.read_text(encoding="utf-8", errors="replace").strip()
+        if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", identity):
+            raise UserError(f"{file} does not hold the ID of a run of Weights & Biases; remove the file")
         self._run: Any = wandb.init(
             project=config.wandb_project,
-            id=identity.read_text().strip(),
+            id=identity,
             name=f"{folder.path.parent.name}/{folder.path.name}",
             dir=str(folder.path),
             config=flatten(config),

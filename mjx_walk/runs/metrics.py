@@ -4,9 +4,11 @@ import csv
 import json
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from mjx_walk.utils.files import replacing
 from mjx_walk.utils.types import Metrics, Reduction
 
 __all__ = ["Row", "name_metrics", "physics_warnings", "read_rows", "write_csv"]
@@ -14,6 +16,7 @@ __all__ = ["Row", "name_metrics", "physics_warnings", "read_rows", "write_csv"]
 Row = dict[str, float]
 """One line of `metrics.jsonl`. `name_metrics` lists the names."""
 
+_MAX_NUMBER = 1e300
 _MANY = 0.01
 """Fraction of non-finite steps above which the physics is not the likely reason."""
 
@@ -76,35 +79,45 @@ def physics_warnings(row: Row, num_steps: int) -> dict[str, str]:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """All rows of a `metrics.jsonl`. Invalid lines are skipped with a warning.
+    """All rows of a `metrics.jsonl`. Invalid lines are skipped, and one warning counts them.
 
     A last line that a crash has cut off is skipped silently.
     """
     if not path.exists():
         return []
     lines = path.read_text(errors="replace").splitlines()
-    rows = []
-    for number, line in enumerate(lines, start=1):
-        row = _as_row(line)
-        if row:
-            rows.append(row)
-        elif number < len(lines):
-            warnings.warn(f"line {number} of {path} cannot be read and is skipped", stacklevel=2)
-    return rows
+    found = [_as_row(line) for line in lines]
+    invalid = [number for number, row in enumerate(found[:-1], start=1) if row is None]
+    if invalid:
+        more = f" and {len(invalid) - 1} more" if len(invalid) > 1 else ""
+        warnings.warn(f"line {invalid[0]}{more} of {path} cannot be read and is skipped", stacklevel=2)
+    return [row for row in found if row is not None]
 
 
 def _as_row(line: str) -> Row | None:
     try:
         row = json.loads(line)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         return None
-    return row if isinstance(row, dict) and "env_steps" in row else None
+    if not isinstance(row, dict) or not all(map(_is_value, row.values())) or not all(map(_is_name, row)):
+        return None
+    return row if all(row.get(name) is not None and row[name] >= 0 for name in ("env_steps", "wall_seconds")) else None
+
+
+def _is_value(value: Any) -> bool:
+    """Whether a value is a finite number of a size that can be drawn, or `null`, which stands for NaN."""
+    return value is None or (type(value) in (int, float) and abs(value) < _MAX_NUMBER)
+
+
+def _is_name(name: str) -> bool:
+    """Whether a metric's name is one that a spreadsheet does not take for a formula, and a terminal can show."""
+    return name[:1].isalpha() and name.isprintable()
 
 
 def write_csv(rows: list[Row], path: Path) -> Path:
     """Write rows as CSV with a column for every name in any row. Missing values are empty."""
     names = dict.fromkeys(name for row in rows for name in row)
-    with path.open("w", newline="") as file:
+    with replacing(path) as new, new.open("w", newline="") as file:
         writer = csv.DictWriter(file, names)
         writer.writeheader()
         writer.writerows(rows)

@@ -52,24 +52,29 @@ def open_existing(path: str | Path | None) -> RunFolder:
     """Open the folder of an existing run.
 
     Raises:
-        UserError: no path, no run at that path, or a symbolic link inside the run.
+        UserError: no path, no run at that path, or a link, pipe or device inside the run.
     """
     if path is None:
         raise UserError("say which run: run=RUN_DIR")
     folder = RunFolder(Path(path))
     if not folder.config.is_file():
         raise UserError(f"no run at '{path}': give the folder that holds its config.yaml")
-    _refuse_links(folder.path)
+    _refuse_special_files(folder.path)
     return folder
 
 
-def _refuse_links(folder: Path) -> None:
-    """Refuse a folder whose files would be written elsewhere. What Weights & Biases links in its own folder stays."""
+def _refuse_special_files(folder: Path) -> None:
+    """Refuse links, which lead elsewhere, and pipes and devices, which block a reader or never end.
+
+    What Weights & Biases links in its own folder stays.
+    """
     for directory, folders, files in os.walk(folder):
         for name in [*folders, *files]:
             path = Path(directory, name)
             if path.is_symlink():
                 raise UserError(f"'{path}' is a symbolic link; replace it by what it points to")
+            if not (path.is_file() or path.is_dir()):
+                raise UserError(f"'{path}' is not a regular file; remove it")
         if Path(directory) == folder:
             folders[:] = [name for name in folders if name != "wandb"]
 
@@ -141,12 +146,19 @@ def _check(folder: RunFolder, config: Config) -> None:
         return
     saved = read_config(open_existing(folder.path).config)
     differing = differences(saved, config)
+    if _name_same_function(saved.env.reward_function, config.env.reward_function):  # which may have moved
+        differing = [text for text in differing if not text.startswith("env.reward_function ")]
     if differing:
         raise UserError(f"resume=true with another configuration than {folder.config}: {'; '.join(differing)}")
     if folder.gymnasium_scores.exists() and not list_steps(folder.checkpoints):
         raise UserError(f"no checkpoint in {folder.checkpoints}, although the run was scored; choose another run_dir")
     if config.total_steps < saved.total_steps:
         raise UserError(f"total_steps={config.total_steps} is below this run's {saved.total_steps}; it may only grow")
+
+
+def _name_same_function(source: str | None, other: str | None) -> bool:
+    """Whether two `PATH.py:FUNCTION` differ at most in the folder of the file."""
+    return bool(source and other) and Path(str(source)).name == Path(str(other)).name
 
 
 def _newest(folder: RunFolder) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_walk.utils.files import write_text
 from mjx_walk.utils.versions import package_versions
 
 __all__ = ["BEST", "BETTER", "FINAL", "POLICIES", "ScoreFile", "Scores", "read_scores", "write_scores"]
@@ -18,6 +19,8 @@ BEST = "best"
 POLICIES = (FINAL, BEST)
 BETTER = "better"
 """The better of both, chosen on the scored episodes themselves: what a file with one block holds."""
+
+_MAX_NUMBER = 1e300
 
 
 @dataclasses.dataclass
@@ -90,9 +93,7 @@ def write_scores(path: Path, env: str, blocks: dict[str, dict[str, Any]], **fact
         facts: JSON-serializable facts about the run.
     """
     content = {"env": env, **blocks, **facts} | {"versions": package_versions()}
-    unfinished = path.with_suffix(".unfinished")
-    unfinished.write_text(json.dumps(content, indent=1))
-    unfinished.replace(path)
+    write_text(path, json.dumps(content, indent=1))
 
 
 def read_scores(path: Path) -> ScoreFile:
@@ -101,7 +102,10 @@ def read_scores(path: Path) -> ScoreFile:
     Raises:
         ValueError: the file is not of this format.
     """
-    content = json.loads(path.read_text())
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except RecursionError as error:
+        raise ValueError(f"{path} is nested too deeply") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path} holds no object")
     env = content.pop("env", "")
@@ -119,4 +123,4 @@ def read_scores(path: Path) -> ScoreFile:
 
 
 def _are_numbers(*values: Any) -> bool:
-    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+    return all(type(value) in (int, float) and abs(value) < _MAX_NUMBER for value in values)

@@ -32,7 +32,10 @@ def restore_newest(checkpoints: Path, like: TrainState, processes: Processes) ->
     index, count = processes.process_index, processes.process_count
 
     def part(path: Path) -> Path:
-        former_count = checkpoint.read_meta(path).get(NUM_DEVICES, 1)
+        facts = checkpoint.read_meta(path)
+        if "wall_seconds" not in facts:
+            raise ValueError(f"{path} is damaged: its facts lack wall_seconds")
+        former_count = facts.get(NUM_DEVICES, 1)
         return device_folder(checkpoints, index % former_count) / path.name
 
     def agree(is_complete: bool) -> bool:

@@ -9,6 +9,7 @@ import difflib
 import errno
 import logging
 import sys
+import tempfile
 import typing
 import warnings
 from collections.abc import Callable, Iterator
@@ -22,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mjx_walk.utils.compat import exempt_imports_from_gc, prepare_jax
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import check_replaceable
 from mjx_walk.utils.settings import validate
 from mjx_walk.utils.signals import Stopped, exit_code
 
@@ -104,18 +106,16 @@ def read_seeds(value: Any) -> list[int]:
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file can be written, before a command works for it. A new file is removed again.
+    """Check that a file can be written, before a command works for it. The file stays as it is.
 
     Raises:
         UserError: the file or its folder cannot be written.
     """
-    is_new = not path.exists()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("ab"):
+        check_replaceable(path)
+        with tempfile.TemporaryFile(dir=path.parent):
             pass
-        if is_new:
-            path.unlink()
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
 

@@ -10,6 +10,10 @@ from mjx_walk.utils.errors import UserError
 __all__ = ["AnyBut", "describe", "has_effect", "refuse_ineffective", "setting", "validate"]
 
 
+_MAX_INT = 10**12
+"""No count is larger. JAX cannot hold shapes from 2**63 elements on, and some of its errors end the process."""
+
+
 class AnyBut(NamedTuple):
     """A condition on a setting: every value except this one."""
 
@@ -65,6 +69,8 @@ def _problem(value: Any, limits: Any) -> str | None:
         return None
     if isinstance(value, float) and math.isnan(value):
         return "must be a number"
+    if isinstance(value, int) and abs(value) > _MAX_INT:
+        return f"must be at most {_MAX_INT}"
     # A value that compares with nothing fails these tests.
     if "above" in limits and not value > limits["above"]:
         return f"must be above {limits['above']}"

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from matplotlib.axes import Axes
 
+from mjx_walk.utils.files import replacing
 from mjx_walk.viewing.episode import Episode
 
 _NUM_FRAMES = 8
@@ -41,7 +42,8 @@ def draw_gait_sheet(episode: Episode, path: Path) -> Path:
     _lines(figure.add_subplot(grid[4, 1]), episode, shown, episode.reward_terms, "reward term per step")
     for axes in figure.axes[1:]:
         axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=100)
+    with replacing(path) as new:
+        figure.savefig(new, dpi=100)
     return path
 
 

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import write_text
 from mjx_walk.viewing.episode import Episode
 
 _TEMPLATE = Path(__file__).with_name("page.html")
@@ -57,14 +58,14 @@ def write_page(episode: Episode, path: Path) -> Path:
     page = string.Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
         title=episode.env,
         library=_inside_script(require_library().read_text(encoding="utf-8")),
-        episode=_inside_script(json.dumps(data, separators=(",", ":"))),
+        episode=json.dumps(data, separators=(",", ":")).replace("<", r"\u003c"),  # no string can end the element
     )
-    path.write_text(page, encoding="utf-8")
+    write_text(path, page)
     return path
 
 
 def _inside_script(text: str) -> str:
-    """Escape JavaScript or JSON so that it cannot close the `<script>` element around it."""
+    """Escape JavaScript so that it cannot close the `<script>` element around it."""
     return re.sub("</(?=script)", r"<\\/", text, flags=re.IGNORECASE)
 
 

@@ -11,6 +11,7 @@ import imageio.v3 as iio
 import numpy as np
 
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import replacing
 
 _PROBE = "import mujoco; mujoco.GLContext(64, 64).make_current()"
 
@@ -48,7 +49,7 @@ def write_film(frames: list[np.ndarray], path: Path, frames_per_second: float) -
     height, width = (size // 2 * 2 for size in frames[0].shape[:2])
     even = [frame[:height, :width] for frame in frames]
     options: dict[str, Any] = {"quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), replacing(path) as new:
         # Starting ffmpeg forks, and Python warns of a fork in a process with threads; JAX has some.
         warnings.simplefilter("ignore", RuntimeWarning)
-        iio.imwrite(path, even, plugin="FFMPEG", fps=frames_per_second, **options)
+        iio.imwrite(new, even, plugin="FFMPEG", fps=frames_per_second, **options)

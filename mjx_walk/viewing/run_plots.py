@@ -9,11 +9,13 @@ from matplotlib.axes import Axes
 
 from mjx_walk.runs.metrics import Row, read_rows, write_csv
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.utils.files import replacing
 
 _X_AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))
 """Key of a row, unit and label of each horizontal axis."""
 _QUANTITIES = (("return", "return"), ("length", "episode length"))
 """Key of a row after its prefix, and label, of each vertical axis."""
+_MAX_PLOTS = 32
 
 
 def plot_run(folder: RunFolder) -> list[Path]:
@@ -70,12 +72,14 @@ def _learning_curve(rows: list[Row], path: Path) -> Path:
     first = figure.axes[0]
     if first.get_legend_handles_labels()[0]:
         first.legend()
-    figure.savefig(path, dpi=110)
+    with replacing(path) as new:
+        figure.savefig(new, dpi=110)
     return path
 
 
 def _grid(rows: list[Row], names: list[str], ylabel: str, path: Path) -> Path:
-    """Draw one small plot per metric."""
+    """Draw one small plot per metric, up to `_MAX_PLOTS`."""
+    names = names[:_MAX_PLOTS]
     num_columns = min(len(names), 4) or 1
     num_rows = -(-len(names) // num_columns) or 1
     figure = matplotlib.figure.Figure(figsize=(3.4 * num_columns, 2.4 * num_rows), layout="constrained")
@@ -85,9 +89,10 @@ def _grid(rows: list[Row], names: list[str], ylabel: str, path: Path) -> Path:
     for axes, name in zip(plots, names, strict=False):
         x, y = series(rows, "env_steps", name)
         axes.plot(x / 1e6, y)
-        axes.set_title(name.partition("/")[2], fontsize=9)
+        axes.set_title(name.partition("/")[2], fontsize=9, parse_math=False)
         axes.set_xlabel("million steps", fontsize=8)
         axes.set_ylabel(ylabel, fontsize=8)
         axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as new:
+        figure.savefig(new, dpi=110)
     return path

@@ -140,7 +140,7 @@ def test_a_run_folder_alone_runs_no_code(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("function", "says"),
     [
-        ("nowhere.py:f", "no file 'nowhere.py'; write PATH.py:FUNCTION"),
+        ("nowhere.py:f", "nowhere.py'; write PATH.py:FUNCTION"),
         ("upright", "write PATH.py:FUNCTION"),
         ("my_reward.py:missing", "has no function 'missing'"),
         ("my_reward.py:broken", "NameError: name 'missing' is not defined"),

@@ -62,7 +62,7 @@ def test_only_the_newest_are_kept(tmp_path):
 
 
 def test_another_shape_or_version_is_named(tmp_path):
-    checkpoint.save(tmp_path / "x", TREE, {})
+    checkpoint.save(tmp_path / "x", TREE, {"env_steps": 0})
     with pytest.raises(UserError, match=r"a should be \(2, 4\) float32, found \(2, 3\) float32"):
         checkpoint.restore(tmp_path / "x", TREE | {"a": jnp.zeros((2, 4))})
     meta = json.loads((tmp_path / "x" / "meta.json").read_text())

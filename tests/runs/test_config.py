@@ -111,6 +111,27 @@ def test_overrides_beat_the_recipe(tmp_path):
     assert read_config(tmp_path / "config.yaml") == humanoid
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("_target_: os.system", "defaults: [train]", "hydra: {run: {dir: /tmp/x}}", "seed: {a: 1}", "seed: [1]"),
+        *("env: {name: walker2d, _target_: os.system}", "env: {name: walker2d, shaping: 7}", "num_envs: 1e99"),
+        *("env: {name: walker2d, shaping: {deep: {er: 1}}}", "algo: {name: ppo, policy_hidden_layer_sizes: x}"),
+        *("algo: {name: __class__}", "env: null", "evaluation: null", "total_steps: .nan", "resume: maybe"),
+        *("checkpoint: {every_calls: 0}", "matmul_precision: high", "env: {name: walker2d, healthy_z_range: [a]}"),
+    ],
+)
+def test_any_line_of_a_strangers_configuration_costs_one_line(tmp_path, line):
+    save_config(load_config(["env=walker2d", "algo=ppo", "hardware=cpu"]), tmp_path / "config.yaml")
+    saved = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    for key, value in yaml.safe_load(line).items():
+        saved[key] = saved[key] | value if isinstance(value, dict) and key in ("env", "algo", "checkpoint") else value
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(saved))
+    with pytest.raises(UserError) as error:
+        make_task(read_config(tmp_path / "config.yaml"))
+    assert "\n" not in str(error.value)
+
+
 FORMER = ["algo.entropy_cost=0.25", "updates_per_chunk=3", "checkpoint.every_chunks=7"]
 PRESENT = {"algo.entropy_coef": 0.25, "iterations_per_call": 3, "checkpoint.every_calls": 7}
 
@@ -128,6 +149,16 @@ def renamings(warned):
         (b"seed: 1\n", "is not a configuration of this version"),
         (b"- 1\n", "is not a configuration of this version"),
         (b"just text\n", "is not a configuration of this version"),
+        (b"", "is not a configuration of this version"),
+        (b"env:\n  name: [walker2d]\nalgo:\n  name: ppo\n", "is not a configuration of this version"),
+        (b"[" * 1500, "is not a configuration of this version"),
+        (b"a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n", "line 1 of .*config.yaml has an anchor"),
+        (b"a: *a\n", "line 1 of .*config.yaml has an alias"),
+        (b"seed: 1\nrun_dir: !!python/object/apply:os.system ['touch ran']\n", "line 2 of .*config.yaml has a tag"),
+        (b"run_dir: !!python/object/apply:pathlib.PosixPath [x]\n", "has a tag"),
+        (b'run_dir: "a\\e[2Jb"\n', "line 1 of .*config.yaml has characters that cannot be printed"),
+        ("run_dir: a\u202eb\n".encode(), "has characters that cannot be printed"),
+        (b"#" * 100_001, "is larger than 100,000 bytes"),
     ],
 )
 def test_a_strangers_configuration_is_refused_in_one_line(tmp_path, text, says):

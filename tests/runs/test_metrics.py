@@ -1,24 +1,76 @@
 """A run's log, as it is read back."""
 
 import json
+import os
 
 import pytest
 
 from mjx_walk.runs.loggers import MetricsWriter
 from mjx_walk.runs.metrics import read_rows
+from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.viewing.run_plots import plot_run
+
+
+def line(step):
+    return f'{{"env_steps": {step}, "wall_seconds": {step}.5}}\n'
 
 
 def test_a_last_line_that_was_cut_off_is_left_out(tmp_path, recwarn):
     path = tmp_path / "metrics.jsonl"
-    path.write_bytes(b'{"env_steps": 1}\n{"env_steps": 2}\n\xff\xfe{"env')
-    assert read_rows(path) == [{"env_steps": 1}, {"env_steps": 2}] and not recwarn
+    path.write_text(line(1) + line(2))
+    with path.open("ab") as file:
+        file.write(b'\xff\xfe{"env')
+    assert [row["env_steps"] for row in read_rows(path)] == [1, 2] and not recwarn
     assert read_rows(tmp_path / "nowhere") == []
 
 
-@pytest.mark.parametrize("damage", ["garbage", "7", "{}"])
+DAMAGE = [
+    *("garbage", "7", "{}", "[]", "[" * 100_000, '{"env_steps": 2}', '{"wall_seconds": 2}'),
+    *(f'{{"env_steps": {value}, "wall_seconds": 1}}' for value in ('"2"', "true", "null", "-1", "NaN", "Infinity")),
+    f'{{"env_steps": 2, "wall_seconds": {"1" * 5000}}}',
+    *(f'{{"env_steps": 2, "wall_seconds": 1, "episode/return": {value}}}' for value in ('"x"', "[1]", "{}", "1e999")),
+    *(f'{{"env_steps": 2, "wall_seconds": 1, "{name}": 1}}' for name in ("=HYPERLINK(1)", "+1", "a\\u001b[2J", "")),
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGE, ids=range(len(DAMAGE)))
 def test_a_damaged_line_costs_no_other_line_and_is_told(tmp_path, damage):
     path = tmp_path / "metrics.jsonl"
-    path.write_text('{"env_steps": 1}\n' + damage + '\n{"env_steps": 3}\n{"env_steps": 4}\n')
+    path.write_text(line(1) + damage + "\n" + line(3) + line(4))
     with pytest.warns(UserWarning, match=r"line 2 of .*metrics\.jsonl cannot be read"):
         MetricsWriter(tmp_path, resume_steps=3).close()
-    assert [json.loads(line) for line in path.read_text().splitlines()] == [{"env_steps": 1}, {"env_steps": 3}]
+    assert path.read_text() == line(1) + line(3)
+
+
+def test_many_damaged_lines_cost_one_warning(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text("x\n" * 1000 + line(3))
+    with pytest.warns(UserWarning, match="line 1 and 999 more of") as warned:
+        assert len(read_rows(path)) == 1
+    assert len(warned) == 1
+
+
+def test_a_log_is_never_written_through_a_link(tmp_path):
+    """Neither one that was there, nor one that is put in place between the check and the first row."""
+    (tmp_path / "precious").write_text("mine")
+    path = tmp_path / "metrics.jsonl"
+    os.link(tmp_path / "precious", path)
+    MetricsWriter(tmp_path, resume_steps=3).close()
+    path.unlink()
+    path.symlink_to(tmp_path / "precious")
+    with pytest.raises(OSError, match="symbolic links"):
+        MetricsWriter(tmp_path)
+    assert (tmp_path / "precious").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", [r"episode/reward_$\frac$", "episode/reward_" + "x" * 5000, "train/$$"], ids=range(3))
+def test_names_in_a_log_cannot_stop_the_plots(tmp_path, name):
+    rows = [{"env_steps": step, "wall_seconds": step, name: 1.0, "train/loss": 1e299} for step in (1, 2**63)]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert [path.stat().st_size > 100 for path in plot_run(RunFolder(tmp_path))] == [True] * 4
+
+
+def test_a_log_of_many_names_draws_only_some(tmp_path):
+    row = {"env_steps": 1, "wall_seconds": 1} | {f"train/{i}": 1.0 for i in range(100_000)}
+    (tmp_path / "metrics.jsonl").write_text(json.dumps(row) + "\n")
+    assert len(plot_run(RunFolder(tmp_path))) == 4

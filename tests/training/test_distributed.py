@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command, finish, start, wait_for_line, wait_for_rows
+from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command, finish, saved_leaves, start, wait_for_line, wait_for_rows
 from toy_tasks import ObservedReward
 
 from mjx_walk.algos import make_algorithm
@@ -136,7 +136,7 @@ def test_what_a_device_gathers_stays_in_the_memory_of_what_it_had_gathered_befor
 
 
 def test_a_checkpoint_of_another_run_is_refused_not_passed_over(tmp_path):
-    checkpoint.save(checkpoint.step_path(tmp_path, 10), {"a": np.zeros(3)}, {"env_steps": 10})
+    checkpoint.save(checkpoint.step_path(tmp_path, 10), {"a": np.zeros(3)}, {"env_steps": 10, "wall_seconds": 1.0})
     with pytest.raises(UserError, match="belongs to another run"):
         restore_newest(tmp_path, {"a": np.zeros(4)}, Processes())
 
@@ -151,9 +151,7 @@ def newest(run_dir):
     """The leaves of both devices' newest checkpoints."""
     found = []
     for folder in (run_dir / "checkpoints", run_dir / "checkpoints" / "device_1"):
-        path = checkpoint.list_steps(folder)[-1]
-        parts = [checkpoint._read(part) for part in (path / "arrays", path / "replay") if part.exists()]
-        found.append({name: leaf for part in parts for name, leaf in part.items()})
+        found.append(saved_leaves(checkpoint.list_steps(folder)[-1]))
     return found
 
 

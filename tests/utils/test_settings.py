@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import AnyBut, describe, has_effect, refuse_ineffective, setting
+from mjx_walk.utils.settings import AnyBut, describe, has_effect, refuse_ineffective, setting, validate
 
 
 @dataclasses.dataclass
@@ -76,3 +76,10 @@ def test_a_description_gives_default_range_and_condition():
         "algo.mode=off off|on",
         "algo.sizes=[32,32]",
     ]
+
+
+@pytest.mark.parametrize("seed", [10**12 + 1, -(2**63), 10**4000])
+def test_a_number_that_no_array_can_hold_is_refused(seed):
+    with pytest.raises(UserError, match="must be at most 1000000000000"):
+        validate(Config(seed=seed))
+    validate(Config(seed=10**12))

@@ -1,0 +1,211 @@
+"""Reward functions from Python files, and the helper modules beside them."""
+
+import hashlib
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import itertools
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from mjx_walk.utils.errors import UserError
+
+__all__ = ["RewardFile", "absolute_source", "changed_file", "load_reward_function", "only_known", "reward_path"]
+
+_NUMBERS = itertools.count()
+_PREFIX = "_mjx_walk_reward_"
+"""Start of the names in `sys.modules` of the reward files themselves."""
+_NEVER_HELPERS = sys.stdlib_module_names | {"mjx_walk"}
+_INSTALLED = ("site-packages", "dist-packages")
+
+_known: dict[Path, Mapping[str, str]] = {}
+"""The SHA-256 of all files that a reward file may run, by the path of the reward file. Others may run any."""
+
+
+def reward_path(source: str) -> Path:
+    """Absolute path of the file in `PATH.py:FUNCTION`."""
+    return Path(os.path.abspath(Path(source.rpartition(":")[0]).expanduser()))
+
+
+def absolute_source(source: str, folder: Path) -> str:
+    """`PATH.py:FUNCTION` with an absolute path.
+
+    Args:
+        source: `PATH.py:FUNCTION`.
+        folder: what a relative path is relative to.
+    """
+    path, colon, name = source.rpartition(":")
+    return f"{os.path.abspath(folder / Path(path).expanduser())}:{name}" if colon else source
+
+
+def changed_file(hashes: Mapping[str, str]) -> str | None:
+    """The first file, if any, that is gone or has another SHA-256 than the given one.
+
+    Args:
+        hashes: SHA-256 by absolute path.
+    """
+    for path, expected in hashes.items():
+        if not Path(path).is_file() or hashlib.sha256(Path(path).read_bytes()).hexdigest() != expected:
+            return path
+    return None
+
+
+def only_known(path: Path, hashes: Mapping[str, str] | None) -> None:
+    """Restrict what a reward file may run in this process.
+
+    Args:
+        path: of the reward file.
+        hashes: SHA-256 of that file and its helpers, by absolute path; None removes the restriction.
+    """
+    _known.pop(path, None)
+    if hashes is not None:
+        _known[path] = hashes
+
+
+class RewardFile:
+    """A function of a Python file. The modules beside the file are importable while it is loaded and while it runs.
+
+    Its modules come from the source only: a file in `__pycache__` is never run. Helpers have their usual names, but
+    leave `sys.modules` afterwards, so that another reward file's helper of the same name is another module.
+    """
+
+    def __init__(self, path: Path, name: str):
+        """
+        Args:
+            path: absolute path of the file.
+            name: of the function.
+
+        Raises:
+            Exception: whatever the file raises.
+            UserError: it has no such function, or may not run a file.
+        """
+        self._finder = _Finder(path.parent, _known.get(path))
+        module_name = f"{_PREFIX}{next(_NUMBERS)}"  # dataclasses look their module up in sys.modules
+        module = importlib.util.module_from_spec(self._finder.spec(module_name, path))
+        sys.modules[module_name] = module
+        try:
+            with self._finder:
+                self._finder.exec_module(module)
+            function = vars(module).get(name)
+            if not callable(function):
+                raise UserError(f"'{path}' has no function '{name}'")
+        except BaseException:
+            del sys.modules[module_name]
+            raise
+        self._function: Callable[..., Any] = function
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function."""
+        with self._finder:
+            return self._function(*arguments)
+
+    @property
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of the files that ran so far, by absolute path."""
+        return dict(self._finder.hashes)
+
+
+class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Imports the modules and packages of one folder from their source, inside a `with` block."""
+
+    def __init__(self, folder: Path, known: Mapping[str, str] | None):
+        """
+        Args:
+            folder: the folder.
+            known: SHA-256 of the files that may run, by absolute path; None for any.
+        """
+        self.hashes: dict[str, str] = {}
+        """SHA-256 of the files that ran, by absolute path."""
+        self._folder = folder
+        self._known = known
+        self._tops: set[str] = set()
+        self._loaded: dict[str, ModuleType] = {}
+        self._hidden: dict[str, ModuleType] = {}
+
+    def __enter__(self) -> None:
+        names = {path.stem for path in self._folder.glob("*.py")}
+        names |= {path.parent.name for path in self._folder.glob("*/__init__.py")}
+        names -= _NEVER_HELPERS
+        same = {name: module for name, module in sys.modules.items() if name.partition(".")[0] in names}
+        self._hidden = {name: module for name, module in same.items() if self._is_another_users(module)}
+        for name in self._hidden:
+            del sys.modules[name]
+        sys.modules.update(self._loaded)
+        sys.meta_path.insert(0, self)
+
+    def __exit__(self, *_: object) -> None:
+        sys.meta_path.remove(self)
+        for name in self._loaded:
+            sys.modules.pop(name, None)
+        sys.modules.update(self._hidden)
+
+    def _is_another_users(self, module: ModuleType) -> bool:
+        """Whether a module is neither of this folder nor installed."""
+        file = Path(getattr(module, "__file__", None) or "")
+        return not (file.is_relative_to(self._folder) or {*_INSTALLED} & {*file.parts})
+
+    def spec(self, name: str, path: Path) -> importlib.machinery.ModuleSpec:
+        """A module's spec."""
+        places = [str(path.parent)] if path.name == "__init__.py" else None
+        spec = importlib.util.spec_from_file_location(name, path, loader=self, submodule_search_locations=places)
+        assert spec
+        return spec
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        """The spec of a helper. None for the standard library, this package, and what is not in the folder."""
+        top, dot, _ = name.partition(".")
+        if top in _NEVER_HELPERS or (dot and top not in self._tops):
+            return None
+        place = self._folder.joinpath(*name.split("."))
+        for file in (place / "__init__.py", place.with_name(f"{place.name}.py")):
+            if file.is_file():
+                self._tops.add(top)
+                return self.spec(name, file)
+        return None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Run a module.
+
+        Raises:
+            UserError: the file is not among the known ones.
+        """
+        file = str(module.__file__)
+        source = Path(file).read_bytes()
+        found = hashlib.sha256(source).hexdigest()
+        if self._known is not None and self._known.get(file) != found:
+            raise UserError(f"{file} is new or has changed since you named it; to run it, add this to the command line")
+        self.hashes[file] = found
+        exec(compile(source, file, "exec", dont_inherit=True), vars(module))
+        if not module.__name__.startswith(_PREFIX):
+            self._loaded[module.__name__] = module
+
+
+def load_reward_function(source: str) -> RewardFile:
+    """Load a reward function from a Python file.
+
+    Args:
+        source: `PATH.py:FUNCTION`.
+
+    Raises:
+        UserError: the file or the function does not exist, or the file raises an exception.
+    """
+    path, name = reward_path(source), source.rpartition(":")[2]
+    problem = f"env.reward_function={source}: "
+    if not path.is_file():
+        given = source.rpartition(":")[0] or source
+        raise UserError(f"{problem}no file '{given}'; write PATH.py:FUNCTION")
+    if path.suffix != ".py":
+        raise UserError(f"{problem}'{path}' is not a Python file; write PATH.py:FUNCTION")
+    try:
+        return RewardFile(path, name)
+    except UserError as error:
+        raise UserError(f"{problem}{error}") from error
+    except (Exception, SystemExit) as error:
+        reason = str(error).splitlines()[0] if str(error) else ""
+        raise UserError(f"{problem}{type(error).__name__}: {reason}") from error

@@ -1,0 +1,61 @@
+"""The facts stored with a checkpoint, checked before they are used: the file may come from anywhere."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+__all__ = ["read_facts"]
+
+_MAX_BYTES = 10_000_000
+_MAX_NUMBER = 1e300
+_REQUIRED = ("env_steps", "crc32")
+
+
+def read_facts(path: Path) -> dict[str, Any]:
+    """Read a `meta.json`. Facts that this version does not know are not checked.
+
+    Raises:
+        ValueError: the file cannot be read, or a fact is not what it should be.
+    """
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ValueError(f"it is larger than {_MAX_BYTES:,} bytes")
+        facts = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path.parent} is damaged: {path.name}: {error}") from error
+    if not isinstance(facts, dict):
+        raise ValueError(f"{path} should be a JSON object, found {_shown(facts)}")
+    for name, (is_valid, valid) in _FACTS.items():
+        if name in facts and not is_valid(facts[name]):
+            raise ValueError(f"{path}: {name} should be {valid}, found {_shown(facts[name])}")
+        if name in _REQUIRED and name not in facts:
+            raise ValueError(f"{path}: {name} should be {valid}, found nothing")
+    return facts
+
+
+def _is_count(value: Any, at_least: int = 0) -> bool:
+    return type(value) is int and at_least <= value < 2**63
+
+
+def _is_finite(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) < _MAX_NUMBER
+
+
+_FACTS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "env_steps": (_is_count, "a whole number from 0"),
+    "wall_seconds": (lambda value: _is_finite(value) and value >= 0, "a number from 0"),
+    "num_devices": (lambda value: _is_count(value, 1) and value <= 10**6, "a whole number from 1 to 1,000,000"),
+    "eval_return": (_is_finite, "a finite number"),
+    "format": (_is_count, "a whole number from 0"),
+    "mjx_walk": (lambda value: isinstance(value, str) and value.isprintable() and len(value) < 100, "a version"),
+    "crc32": (lambda value: isinstance(value, dict) and all(map(_is_count, value.values())), "whole numbers by name"),
+}
+"""Facts of a checkpoint: whether a value is valid, and what is."""
+
+
+def _shown(value: Any) -> str:
+    """The start of a value, in one line."""
+    if isinstance(value, int) and not _is_count(abs(value)):
+        return "a huge number"  # Python refuses to print it
+    return ascii(value)[:60] if isinstance(value, str | int | float | None) else f"a JSON {type(value).__name__}"

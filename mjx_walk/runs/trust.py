@@ -1,0 +1,98 @@
+"""The user's own list of reward functions that may run without being named again.
+
+It stands outside any run folder: a downloaded folder cannot bring its own entries.
+"""
+
+import json
+import logging
+import os
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mjx_walk.envs.reward_files import changed_file, only_known, reward_path
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import write_text
+
+__all__ = ["remember", "require_trusted", "trust_file"]
+
+_LOGGER = logging.getLogger(__name__)
+
+Trusted = dict[str, dict[str, str]]
+"""For each `PATH.py:FUNCTION`, the SHA-256 of the file and of its helpers, by absolute path."""
+
+
+def trust_file() -> Path:
+    """Path of the list: `mjx_walk/trusted_reward_functions.json` in `$XDG_CONFIG_HOME`, by default `~/.config`."""
+    base = os.environ.get("XDG_CONFIG_HOME", "")
+    folder = Path(base) if os.path.isabs(base) else Path("~/.config").expanduser()
+    return folder / "mjx_walk" / "trusted_reward_functions.json"
+
+
+def remember(source: str, hashes: Mapping[str, str]) -> None:
+    """Note a reward function that the user has named. A list that cannot be read or written only warns.
+
+    Args:
+        source: absolute `PATH.py:FUNCTION`.
+        hashes: SHA-256 of the file and of its helpers, by absolute path.
+    """
+    trusted = _read()
+    if trusted is None or trusted.get(source) == hashes:
+        return
+    path = trust_file()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        write_text(path, json.dumps(trusted | {source: dict(hashes)}, indent=1), mode=0o600)
+    except (OSError, UserError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        _LOGGER.warning("%s cannot be written (%s); a resume needs %s", path, reason, _named(source))
+
+
+def require_trusted(source: str) -> None:
+    """Check that the user has named a reward function before, and that its files are the same.
+
+    This process then runs only these files for it.
+
+    Args:
+        source: `PATH.py:FUNCTION` of a saved configuration.
+
+    Raises:
+        UserError: the user has not named it, or a file has changed; the message says what to type.
+    """
+    hashes = (_read() or {}).get(source)
+    if hashes is None or not os.path.isabs(source):
+        raise UserError(f"the saved run uses the code of {source}; to run it, add {_named(source)}")
+    changed = changed_file(hashes)
+    if changed:
+        raise UserError(f"{changed} has changed since you named it; to run it as it is now, add {_named(source)}")
+    only_known(reward_path(source), hashes)
+
+
+def _named(source: str) -> str:
+    return shlex.quote(f"env.reward_function={source}")
+
+
+def _read() -> Trusted | None:
+    """The list. None, and a warning, if there is a file that is not such a list."""
+    path = trust_file()
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+    except OSError as error:
+        content, reason = None, error.strerror
+    except (ValueError, RecursionError) as error:
+        content, reason = None, str(error)
+    else:
+        reason = "it is not a list of reward functions"
+    if _is_trusted(content):
+        return content
+    _LOGGER.warning("%s is ignored (%s); remove it, or name the reward function at each resume", path, reason)
+    return None
+
+
+def _is_trusted(content: Any) -> bool:
+    if not isinstance(content, dict) or not all(isinstance(hashes, dict) for hashes in content.values()):
+        return False
+    return all(isinstance(found, str) for hashes in content.values() for found in hashes.values())

@@ -1,0 +1,75 @@
+"""Files that are written completely or not at all, and never through a link."""
+
+import contextlib
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+
+from mjx_walk.utils.errors import UserError
+
+__all__ = ["check_replaceable", "fresh_name", "open_to_append", "replacing", "write_text"]
+
+
+@contextlib.contextmanager
+def replacing(path: Path, mode: int = 0o666) -> Iterator[Path]:
+    """Context manager for writing a file under a fresh name in the same folder. On success it replaces `path`.
+
+    A symbolic or hard link at `path` is replaced; the file that it leads to stays unchanged. On an error, `path` stays
+    as it is, and the new file is removed.
+
+    Args:
+        path: of the file.
+        mode: permissions of the new file, which the user's umask limits.
+
+    Yields:
+        The fresh name, with the suffix of `path`. Its empty file exists.
+
+    Raises:
+        UserError: see `check_replaceable`.
+        OSError: the folder around it cannot be written to.
+    """
+    check_replaceable(path)
+    new = fresh_name(path)
+    os.close(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))
+    try:
+        yield new
+        os.replace(new, path)
+    except BaseException:
+        new.unlink(missing_ok=True)
+        raise
+
+
+def check_replaceable(path: Path) -> None:
+    """Check that a path may be replaced: root could replace /dev/null.
+
+    Raises:
+        UserError: a folder, a device or a pipe, or a file that the user may not write.
+    """
+    if path.exists() and not path.is_file():
+        raise UserError(f"cannot write {path}: it is not a regular file; choose another path")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise UserError(f"cannot write {path}: it is read-only; choose another path, or remove it")
+
+
+def fresh_name(path: Path) -> Path:
+    """An unpredictable, hidden name in the same folder, with the same suffix."""
+    return path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
+
+
+def write_text(path: Path, text: str, mode: int = 0o666) -> None:
+    """Write a UTF-8 file as `replacing` does."""
+    with replacing(path, mode) as new:
+        new.write_text(text, encoding="utf-8")
+
+
+def open_to_append(path: Path) -> int:
+    """Open a file to append to it, and create it if it does not exist. A symbolic link is refused.
+
+    Returns:
+        A file descriptor.
+
+    Raises:
+        OSError: a symbolic link, or a file that cannot be written.
+    """
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW, 0o666)

@@ -1,0 +1,241 @@
+"""A crafted archive is refused before its arrays are read, whatever it declares and whatever it holds."""
+
+import io
+import json
+import pickle
+import subprocess
+import sys
+import zipfile
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tensorstore
+from helpers import CLONE, ENVIRONMENT
+
+from mjx_walk.runs import checkpoint
+from mjx_walk.runs.arrays import read_arrays, write_arrays
+from mjx_walk.utils.errors import UserError
+
+EXPECTED = {
+    "a": np.arange(6, dtype=np.float32).reshape(2, 3),
+    "b": np.zeros((), np.uint32),
+    "c": np.asarray(jnp.arange(3, dtype=jnp.bfloat16)),
+    "d": np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+    "empty": np.zeros((0, 4), np.float32),
+    "flag": np.array([True, False]),
+}
+HUGE = 1_500_000_000
+
+
+def same(name):
+    return name
+
+
+def npy(array, declared=None):
+    """NumPy's file of an array, with another shape in its header if one is declared."""
+    file = io.BytesIO()
+    header = np.lib.format.header_data_from_array_1_0(array) | ({"shape": declared} if declared else {})
+    np.lib.format.write_array_header_1_0(file, header)
+    return file.getvalue() + array.tobytes()
+
+
+def archive(folder, **members):
+    folder.mkdir(parents=True)
+    with zipfile.ZipFile(folder / "arrays.npz", "w", zipfile.ZIP_DEFLATED) as file:
+        for name, content in members.items():
+            file.writestr(f"{name}.npy", content)
+    return folder
+
+
+def zarr(folder, metadata, value=None):
+    """An OCDBT store with one array `a`, as Orbax writes it, but for some metadata."""
+    base = tensorstore.KvStore.open({"driver": "ocdbt", "base": f"file://{folder}/"}).result()
+    usual = {
+        **{"chunks": [2, 3], "compressor": {"id": "zstd", "level": 1}, "dimension_separator": ".", "dtype": "<f4"},
+        **{"fill_value": None, "filters": None, "order": "C", "shape": [2, 3], "zarr_format": 2},
+    }
+    base.write(b"a/.zarray", json.dumps(usual | metadata).encode()).result()
+    if value is not None:
+        base.write(b"a/0.0", value).result()
+    return folder
+
+
+@pytest.mark.parametrize("as_numpy", [True, False])
+def test_round_trip_keeps_every_bit_shape_and_type(tmp_path, as_numpy):
+    arrays = {name: array for name, array in EXPECTED.items() if as_numpy or array.size}  # Orbax saves no empty ones
+    write_arrays(tmp_path / "x", arrays, as_numpy)
+    found = read_arrays(tmp_path / "x", arrays, same)
+    assert found.keys() == arrays.keys()
+    for name, array in arrays.items():
+        assert (found[name].shape, found[name].dtype) == (array.shape, array.dtype)
+        assert found[name].tobytes() == array.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (npy(np.zeros((2, 4), np.float32)), r"a should be \(2, 3\) float32, found \(2, 4\) float32"),
+        (npy(np.zeros((2, 3), np.float64)), r"found \(2, 3\) float64"),
+        (npy(np.zeros((2, 3), ">f4")), r"found \(2, 3\) >f4"),
+        (npy(np.zeros(1, np.float32), declared=(HUGE, 1000)), r"found \(1500000000, 1000\) float32"),
+        (npy(np.zeros((2, 3), np.float32), declared=(-2, -3)), r"found \(-2, -3\) float32"),
+        (npy(np.zeros((2, 3), "V4")), r"found \(2, 3\) \|V4"),
+    ],
+)
+def test_another_shape_or_type_in_a_numpy_archive_is_refused(tmp_path, content, says):
+    with pytest.raises(UserError, match=says):
+        read_arrays(archive(tmp_path / "x", a=content), EXPECTED, same)
+
+
+class Exploit:
+    def __reduce__(self):
+        return (print, ("a pickle ran",))
+
+
+OBJECTS = io.BytesIO()
+np.lib.format.write_array(OBJECTS, np.array([[Exploit()] * 3] * 2, dtype=object), allow_pickle=True)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        npy(np.zeros((2, 3), np.float32)) + b"more than the header says",
+        npy(np.zeros((2, 3), np.float32))[:-1],
+        pickle.dumps(Exploit()),
+        b"",
+        b"\x93NUMPY\x02\x00" + b"\xff" * 100,
+        b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65535,
+    ],
+)
+def test_a_member_that_is_not_what_it_says_is_damage(tmp_path, content):
+    with pytest.raises(ValueError, match="is damaged") as error:
+        read_arrays(archive(tmp_path / "x", a=content), EXPECTED, same)
+    assert not isinstance(error.value, UserError) and "\n" not in str(error.value)
+
+
+def test_a_pickle_in_an_archive_is_not_loaded(tmp_path, capsys):
+    with pytest.raises(UserError, match=r"a should be \(2, 3\) float32, found \(2, 3\) object"):
+        read_arrays(archive(tmp_path / "x", a=OBJECTS.getvalue()), EXPECTED, same)
+    assert "a pickle ran" not in capsys.readouterr().out
+    np.load(io.BytesIO(OBJECTS.getvalue()), allow_pickle=True)  # as a proof that it would run
+    assert "a pickle ran" in capsys.readouterr().out
+
+
+def test_member_paths_have_no_effect(tmp_path):
+    members = {"../../a": b"x", "/etc/a": b"x", "..\\a": b"x", "a": npy(EXPECTED["a"])}
+    found = read_arrays(archive(tmp_path / "deep" / "x", **members), EXPECTED, same)
+    assert found.keys() == {"a"}
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["arrays.npz", "deep", "x"]
+
+
+@pytest.mark.parametrize(
+    ("metadata", "says"),
+    [
+        ({"shape": [HUGE, 1000], "chunks": [HUGE, 1]}, r"a should be \(2, 3\) float32, found \(1500000000, 1000\)"),
+        ({"dtype": "<f8"}, r"found \(2, 3\) float64"),
+        ({"shape": [6], "chunks": [6]}, r"found \(6,\) float32"),
+    ],
+)
+def test_another_shape_or_type_in_an_orbax_folder_is_refused(tmp_path, metadata, says):
+    with pytest.raises(UserError, match=says):
+        read_arrays(zarr(tmp_path / "x", metadata), EXPECTED, same)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "value"),
+    [
+        ({"chunks": [HUGE, 1]}, None),
+        ({"compressor": None}, b"more than the 24 bytes of the array"),
+        ({"dtype": "|O"}, None),
+        ({"compressor": {"id": "evil"}}, b"x"),
+        ({"zarr_format": 9}, None),
+    ],
+)
+def test_metadata_that_orbax_does_not_write_is_damage(tmp_path, metadata, value):
+    with pytest.raises(ValueError, match="is damaged") as error:
+        read_arrays(zarr(tmp_path / "x", metadata, value), EXPECTED, same)
+    assert not isinstance(error.value, UserError) and "\n" not in str(error.value)
+
+
+BOMB = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from mjx_walk.runs.arrays import read_arrays
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    read_arrays(Path(sys.argv[1]), {"a": np.zeros((2, 3), np.float32)}, lambda name: name)
+except ValueError as error:
+    print(str(error).count(chr(10)), (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
+"""
+
+
+COMPRESSORS = {"zstd": {"id": "zstd", "level": 1}, "blosc": {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1}}
+
+
+@pytest.mark.parametrize("kind", ["numpy", "numpy honest", *COMPRESSORS])
+def test_a_small_file_that_unpacks_to_much_takes_no_memory(tmp_path, kind):
+    size = 300_000_000
+    if kind in COMPRESSORS:
+        metadata = {"chunks": [size], "shape": [size], "dtype": "|u1", "compressor": COMPRESSORS[kind]}
+        large = tensorstore.open(
+            {"driver": "zarr", "kvstore": {"driver": "memory"}, "metadata": metadata}, create=True
+        ).result()
+        large.write(np.ones(size, np.uint8)).result()
+        packed = large.kvstore.read(b"0").result().value
+        folder = zarr(tmp_path / "x", {"compressor": COMPRESSORS[kind]}, packed)
+    else:
+        declared = (size // 4,) if kind == "numpy honest" else (2, 3)
+        folder = archive(tmp_path / "x", a=npy(np.zeros(size // 4, np.float32), declared))
+    assert sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) < 4_000_000
+    arguments = [sys.executable, "-c", BOMB, str(folder)]
+    done = subprocess.run(arguments, env=ENVIRONMENT, cwd=CLONE, capture_output=True, text=True, check=True)
+    lines, megabytes = map(int, done.stdout.split())
+    assert lines == 0 and megabytes < 60
+
+
+def saved(tmp_path, **facts):
+    path = checkpoint.step_path(tmp_path, 10)
+    checkpoint.save(path, {"a": EXPECTED["a"]}, {"env_steps": 10, "wall_seconds": 1.0})
+    text = json.loads((path / "meta.json").read_text()) | facts
+    (path / "meta.json").write_text(json.dumps(text))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "valid"),
+    [
+        *(("env_steps", value, "a whole number from 0") for value in (-1, True, 1.5, "10", None, [], 2**63, 10**4000)),
+        *(("wall_seconds", value, "a number from 0") for value in (float("nan"), float("inf"), -1, "1", True, 10**400)),
+        *(("num_devices", value, "a whole number from 1") for value in (0, -1, False, "2", 10**9)),
+        *(("eval_return", value, "a finite number") for value in (float("nan"), "high", {})),
+        *(("crc32", value, "whole numbers by name") for value in ([], {"a": "x"}, {"a": None}, 7)),
+        ("format", "1", "a whole number from 0"),
+        ("mjx_walk", "1\x1b[2J\n", "a version"),
+    ],
+)
+def test_a_fact_of_another_type_is_named(tmp_path, name, value, valid):
+    path = saved(tmp_path, **{name: value})
+    with pytest.raises(ValueError, match=f"{name} should be {valid}.*, found ") as error:
+        checkpoint.restore(path, {"a": EXPECTED["a"]})
+    assert str(path / "meta.json") in str(error.value) and str(error.value).isprintable()
+    with pytest.warns(UserWarning, match="falling back"), pytest.raises(UserError, match="no usable checkpoint"):
+        checkpoint.restore_newest(tmp_path, {"a": EXPECTED["a"]})
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "[]", "7", '{"env_steps": ' + "1" * 5000 + "}", "", "{}", "\0"])
+def test_facts_that_are_no_facts_are_damage(tmp_path, text):
+    path = saved(tmp_path)
+    (path / "meta.json").write_text(text)
+    with pytest.raises(ValueError, match=r"meta\.json") as error:
+        checkpoint.restore(path, {"a": EXPECTED["a"]})
+    assert str(error.value).isprintable()
+
+
+def test_unknown_facts_are_ignored_and_facts_that_are_too_large_are_refused(tmp_path):
+    path = saved(tmp_path, more={"deep": [1, {}]})
+    assert checkpoint.restore(path, {"a": EXPECTED["a"]})[1]["env_steps"] == 10
+    (path / "meta.json").write_text(" " * 10_000_001)
+    with pytest.raises(ValueError, match="larger than 10,000,000 bytes"):
+        checkpoint.restore(path, {"a": EXPECTED["a"]})

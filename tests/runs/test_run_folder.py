@@ -1,0 +1,130 @@
+"""A downloaded run folder: where commands write, and what they leave alone."""
+
+import json
+import os
+import shutil
+
+import pytest
+from helpers import OLD_RUNS, command_here, train_here
+
+from mjx_walk import api
+from mjx_walk.runs import checkpoint
+from mjx_walk.runs.run_folder import open_existing
+from mjx_walk.utils.errors import UserError
+
+
+@pytest.fixture
+def downloaded(tmp_path):
+    return shutil.copytree(OLD_RUNS / "ppo", tmp_path / "downloaded")
+
+
+def change(run_dir, old, new):
+    text = (run_dir / "config.yaml").read_text()
+    assert old in text
+    (run_dir / "config.yaml").write_text(text.replace(old, new))
+
+
+def contents(folder):
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_resume_writes_to_the_folder_that_was_named(downloaded, tmp_path):
+    """Not to the one that its configuration names, which here holds another run."""
+    mine = shutil.copytree(OLD_RUNS / "ppo", tmp_path / "mine")
+    saved = next(line for line in (downloaded / "config.yaml").read_text().splitlines() if line.startswith("run_dir:"))
+    change(downloaded, saved, f"run_dir: {mine}")
+    before = contents(mine)
+    train_here(downloaded, "resume=true", "total_steps=32", tiny=[])
+    assert contents(mine) == before
+    assert [int(path.name) for path in checkpoint.list_steps(downloaded / "checkpoints")][-1] == 32
+
+
+def test_a_link_above_the_run_folder_is_followed(downloaded, tmp_path):
+    """Data folders are often links."""
+    (tmp_path / "data").symlink_to(tmp_path, target_is_directory=True)
+    assert command_here("eval", f"run={tmp_path}/data/downloaded", "episodes=1") == 0
+    assert (downloaded / "eval_gymnasium.json").exists()
+
+
+def test_hard_links_to_files_outside_are_replaced_by_all_that_write(downloaded, tmp_path):
+    names = ("eval_gymnasium.json", "policy.onnx", "page.html", "learning_curve.png", "reward_terms.png")
+    names += ("losses.png", "metrics.csv", "metrics.jsonl", "config.yaml")
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    for name in names:
+        path = downloaded / name
+        shutil.copy(path, outside / name) if path.exists() else (outside / name).write_text("mine")
+        path.unlink(missing_ok=True)
+        os.link(outside / name, path)
+    before = contents(outside)
+    run = f"run={downloaded}"
+    for command, *arguments in (
+        ("train", f"run_dir={downloaded}", "resume=true", "total_steps=32"),
+        ("eval", run, "episodes=1"),
+        ("play", run, f"html={downloaded}/page.html"),
+        ("export", run),
+        ("plots", run),
+    ):
+        assert command_here(command, *arguments) == 0
+    assert contents(outside) == before
+    assert all((downloaded / name).stat().st_nlink == 1 for name in names)
+
+
+@pytest.mark.parametrize("name", ["metrics.jsonl", "checkpoints/best/meta.json", "wandb_id.txt"])
+def test_a_pipe_in_a_run_folder_is_refused(downloaded, name):
+    """A reader would wait for ever."""
+    (downloaded / name).unlink(missing_ok=True)
+    os.mkfifo(downloaded / name)
+    with pytest.raises(UserError, match=f"{name}' is not a regular file; remove it"):
+        open_existing(downloaded)
+
+
+def test_a_saved_project_of_weights_and_biases_is_used_only_if_it_is_named(downloaded):
+    change(downloaded, "wandb_project: null", "wandb_project: theirs")
+    resume = [f"run_dir={downloaded}", "resume=true"]
+    with pytest.raises(UserError, match="to go on, add wandb_project=theirs, or wandb_project=null"):
+        api.resolve(resume)
+    assert api.resolve([*resume, "wandb_project=theirs"]).wandb_project == "theirs"
+    assert api.resolve([*resume, "wandb_project=null"]).wandb_project is None
+
+
+def test_what_a_message_says_to_type_is_quoted(downloaded):
+    change(downloaded, "wandb_project: null", "wandb_project: x; touch owned")
+    with pytest.raises(UserError, match="add 'wandb_project=x; touch owned', or"):
+        api.resolve([f"run_dir={downloaded}", "resume=true"])
+
+
+def test_later_checkpoints_do_not_crowd_out_new_ones(tmp_path):
+    """They are of a run that went on from before them, or a stranger's."""
+    tree = {"a": 1.0}
+    for steps in (10, 70, 80, 90):
+        checkpoint.save(checkpoint.step_path(tmp_path, steps), tree, {"env_steps": steps})
+    saver = checkpoint.BackgroundSaver(tmp_path, keep=2)
+    saver.save((checkpoint.step_path(tmp_path, 20), tree, {"env_steps": 20}))
+    saver.wait()
+    assert [int(path.name) for path in checkpoint.list_steps(tmp_path)] == [10, 20]
+    saver.save((tmp_path / "best", tree, {"env_steps": 5}))
+    saver.wait()
+    assert [int(path.name) for path in checkpoint.list_steps(tmp_path)] == [10, 20]
+
+
+def test_a_save_that_fails_leaves_nothing_behind(tmp_path):
+    path = checkpoint.step_path(tmp_path, 10)
+    checkpoint.save(path, {"a": 1.0}, {"env_steps": 10})
+    before = contents(tmp_path)
+    with pytest.raises(TypeError):
+        checkpoint.save(path, {"a": 2.0}, {"env_steps": object()})
+    assert contents(tmp_path) == before and [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_link_put_in_place_of_a_half_written_checkpoint_is_not_followed(tmp_path, monkeypatch):
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "meta.json").write_text(json.dumps("mine"))
+    monkeypatch.setattr("secrets.token_hex", lambda size: "guessed")
+    checkpoints = tmp_path / "checkpoints"
+    checkpoints.mkdir()
+    (checkpoints / ".best.guessed.unfinished").symlink_to(precious, target_is_directory=True)
+    with pytest.raises(FileExistsError):
+        checkpoint.save(checkpoints / "best", {"a": 1.0}, {"env_steps": 0})
+    assert (precious / "meta.json").read_text() == '"mine"'
