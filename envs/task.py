@@ -1,23 +1,22 @@
 """The contract of a task, and what all Gymnasium tasks share: model, engine, resets, finiteness check, time limit."""
 
 import abc
-import dataclasses
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import flax
-import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
+from mjx_walk.envs.models import load_model
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
-from mjx_walk.envs.reward_shaping import RewardStep, Shaping, Terms, load_reward_function, shaping_terms, term_names
+from mjx_walk.envs.resets import InitialState
+from mjx_walk.envs.reward_shaping import RewardStep, Terms, load_reward_function, shaping_terms, term_names
+from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import setting
 
 MAX_ABS_VALUE = 1e10
 """Largest valid position or velocity, as in MuJoCo's own check (`mjMAXVAL`)."""
@@ -80,40 +79,17 @@ class TrainableTask(Protocol):
         return center + (self.action_high - self.action_low) / 2 * jnp.clip(action, -1.0, 1.0)
 
 
-@dataclasses.dataclass
-class TaskOptions:
-    """Env options of all tasks. Subclasses add the keyword arguments of their Gymnasium class."""
+class View(NamedTuple):
+    """What films, pages and gait sheets show of a task."""
 
-    name: str = ""
-    version: str = setting("v5", choices=("v5", "v4"))
-    xml_file: str | None = None
-    """Model file, resolved as in Gymnasium. Default: the version's own model."""
-    frame_skip: int = setting(5, at_least=1)
-    reset_noise_scale: float = setting(1e-2, at_least=0)
-    exclude_current_positions_from_observation: bool = True
-    max_episode_steps: int = setting(1000, at_least=1)
-    shaping: Shaping = dataclasses.field(default_factory=Shaping)
-    """Weights of additional reward terms."""
-    reward_function: str | None = None
-    """`PATH.py:FUNCTION`, a custom reward that replaces Gymnasium's; see `mjx_walk.envs.reward_shaping`."""
-
-    def __post_init__(self):
-        for name, value in list(vars(self).items()):
-            if isinstance(value, list):  # a configuration file gives a range as a list
-                setattr(self, name, tuple(value))
-        if self.xml_file and _model_path(self.xml_file).is_file():
-            # An absolute path stays valid when a run is loaded from another working directory.
-            self.xml_file = str(_model_path(self.xml_file).resolve())
-        if isinstance(self.shaping, dict):
-            unknown = self.shaping.keys() - {field.name for field in dataclasses.fields(Shaping)}
-            if unknown:
-                raise UserError(f"unknown key 'env.shaping.{min(unknown)}'")
-            self.shaping = Shaping(**self.shaping)
-
-    def changed(self) -> dict[str, Any]:
-        """Options that differ from their defaults."""
-        defaults = vars(type(self)())
-        return {name: value for name, value in vars(self).items() if value != defaults[name]}
+    body: int = 1
+    """Body whose height and speed they show. In Gymnasium's models, body 1 is the root, and the world is body 0."""
+    center: tuple[float, float, float] | None = None
+    """Point that the camera looks at, m. Default: the camera follows the body."""
+    distance: float = 4.0
+    """From the camera to its center, m."""
+    elevation: float = -8.0
+    """Angle of the line of sight above the horizon, degrees; -90 looks straight down."""
 
 
 class Task(TrainableTask, abc.ABC):
@@ -130,8 +106,17 @@ class Task(TrainableTask, abc.ABC):
     """Signed reward terms of each version, under the names of Gymnasium's `info`."""
     V5_ONLY: tuple[str, ...] = ("xml_file", "frame_skip")
     """Env options that Gymnasium's v4 class does not take."""
+    V4_ONLY: tuple[str, ...] = ()
+    """Env options that Gymnasium's v5 class does not take."""
+    MISSING_VERSIONS: dict[str, str] = {}
+    """Why a version is not available, by version."""
+    HAS_X: bool = True
+    """Whether `qpos[0]` is the root's forward coordinate x."""
     HAS_Y: bool = True
-    """Whether `qpos[1]` is the lateral coordinate y."""
+    """Whether `qpos[1]` is the root's lateral coordinate y."""
+    HEIGHT_INDEX: int | None = None
+    """Index of the root's height in `qpos`. None: the root cannot leave the ground."""
+    VIEW: View = View()
 
     def __init__(self, options: TaskOptions, physics: str = "auto"):
         """
@@ -143,12 +128,7 @@ class Task(TrainableTask, abc.ABC):
             UserError: an unknown version or engine, an option that v4 does not take, shaping that has no effect, or a
                 model file or reward function that is missing or invalid.
         """
-        if options.version not in self.XML_FILES:
-            raise UserError(f"unknown version '{options.version}' of {options.name}; choose one of: v5, v4")
-        changed = options.changed()
-        not_in_v4 = [name for name in self.V5_ONLY if name in changed]
-        if options.version == "v4" and not_in_v4:
-            raise UserError(f"{options.name} v4 does not take {', '.join(not_in_v4)}; use version=v5")
+        _check_version(self, options)
         self.options = options
         self.max_episode_steps = options.max_episode_steps
         self.model = load_model(options.xml_file or self.XML_FILES[options.version])
@@ -160,6 +140,7 @@ class Task(TrainableTask, abc.ABC):
         self.init_qpos = jnp.asarray(self.model.qpos0, jnp.float32)
         self.init_qvel = jnp.zeros(self.model.nv, jnp.float32)
         self.observation_size = sum(self.observation_blocks().values())
+        self._motor_dofs = _motor_dofs(self.model)
         self._check_shaping()
         self._reward_function = load_reward_function(options.reward_function) if options.reward_function else None
         self.reward_terms = self._reward_term_names()
@@ -167,6 +148,8 @@ class Task(TrainableTask, abc.ABC):
 
     def _check_shaping(self) -> None:
         name, shaping = self.options.name, self.options.shaping
+        if shaping.backward and not self.HAS_X:
+            raise UserError(f"env.shaping.backward={shaping.backward}: {name} has no x coordinate; set it to 0")
         if shaping.keep_y and not self.HAS_Y:
             raise UserError(f"env.shaping.keep_y={shaping.keep_y}: {name} has no y coordinate; set it to 0")
         if shaping.falling and not self.terminates_on_fall:
@@ -182,6 +165,11 @@ class Task(TrainableTask, abc.ABC):
         return {name: value for name, value in self.options.changed().items() if name not in _NOT_IN_GYMNASIUM}
 
     @property
+    def gymnasium_reward_terms(self) -> tuple[str, ...]:
+        """Names of the terms of Gymnasium's reward."""
+        return self.REWARD_TERMS[self.options.version]
+
+    @property
     def has_custom_reward(self) -> bool:
         """Whether the reward differs from Gymnasium's."""
         return self._reward_function is not None or any(vars(self.options.shaping).values())
@@ -192,6 +180,10 @@ class Task(TrainableTask, abc.ABC):
     def terminates_on_fall(self) -> bool:
         """Whether a fall terminates the episode."""
         return False
+
+    @abc.abstractmethod
+    def initial_state(self, key: PRNGKeyArray) -> InitialState:
+        """Draw the position and velocity of a reset. Source: `reset_model` of the Gymnasium class."""
 
     @abc.abstractmethod
     def derived_names(self) -> tuple[str, ...]:
@@ -229,12 +221,8 @@ class Task(TrainableTask, abc.ABC):
     # Shared by all tasks.
 
     def reset(self, key: PRNGKeyArray) -> State:
-        """Random initial state. Source: `reset_model` of the Gymnasium classes, uniform noise on the model's pose."""
-        qpos_key, qvel_key = jax.random.split(key)
-        scale = self.options.reset_noise_scale
-        qpos_noise = jax.random.uniform(qpos_key, self.init_qpos.shape, minval=-scale, maxval=scale)
-        qvel_noise = jax.random.uniform(qvel_key, self.init_qvel.shape, minval=-scale, maxval=scale)
-        return self.reset_to(self.init_qpos + qpos_noise, self.init_qvel + qvel_noise)
+        """Random initial state, drawn by `initial_state`."""
+        return self.reset_to(*self.initial_state(key))
 
     def reset_to(
         self,
@@ -313,16 +301,16 @@ class Task(TrainableTask, abc.ABC):
         if self._reward_function:
             terms = {name: jnp.float32(term) for name, term in self._reward_function(step).items()}
             reward = sum(terms.values(), jnp.float32(0.0))
-        added = shaping_terms(self.options.shaping, step)
+        added = shaping_terms(self.options.shaping, step, self._motor_dofs)
         return terms | added, sum(added.values(), reward)
 
     def _reward_term_names(self) -> tuple[str, ...]:
         """Names of all reward terms, found by tracing `reward_function` on an example step."""
-        terms = dict.fromkeys(self.REWARD_TERMS[self.options.version], jnp.float32(0.0))
+        terms = dict.fromkeys(self.gymnasium_reward_terms, jnp.float32(0.0))
         physics = PhysicsState(self.init_qpos, self.init_qvel, self.init_qvel)
         obs, action = jnp.zeros(self.observation_size), jnp.zeros(self.action_size)
         step = RewardStep(terms, jnp.float32(0.0), physics, physics, obs, action, jnp.zeros((), bool), self.dt)
-        names, shaped = tuple(terms), shaping_terms(self.options.shaping, step)
+        names, shaped = tuple(terms), shaping_terms(self.options.shaping, step, self._motor_dofs)
         if self._reward_function:
             names = term_names(self._reward_function, str(self.options.reward_function), step, shaped)
         return (*names, *shaped)
@@ -333,27 +321,24 @@ def _is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[
     return jnp.array([jnp.all(jnp.abs(x) < limit) for x in arrays]).all()
 
 
-def _model_path(xml_file: str) -> Path:
-    """Path of a model by the rules of Gymnasium's `xml_file`: a bare name is an asset of Gymnasium."""
-    path = Path(xml_file).expanduser()
-    if len(path.parts) == 1 and not path.exists():
-        return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / xml_file
-    return path
-
-
-def load_model(xml_file: str) -> mujoco.MjModel:
-    """Load a MuJoCo model.
-
-    Args:
-        xml_file: name of one of Gymnasium's assets, or a path.
+def _check_version(task: Task, options: TaskOptions) -> None:
+    """Check that Gymnasium has the version, and that its class takes the options that differ from their defaults.
 
     Raises:
-        UserError: the file does not exist, or MuJoCo cannot read it.
+        UserError: it does not.
     """
-    path = _model_path(xml_file)
-    if not path.is_file():
-        raise UserError(f"model file not found: {path}")
-    try:
-        return mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise UserError(f"MuJoCo cannot read {path}: {str(error).splitlines()[0]}") from error
+    name, version = options.name, options.version
+    if version not in task.XML_FILES:
+        reason = task.MISSING_VERSIONS.get(version, f"unknown version '{version}' of {name}")
+        raise UserError(f"{reason}; choose one of: {', '.join(task.XML_FILES)}")
+    for only, other in (("v5", "v4"), ("v4", "v5")):
+        names = task.V5_ONLY if only == "v5" else task.V4_ONLY
+        refused = [option for option in names if option in options.changed()]
+        if version == other and refused:
+            raise UserError(f"{name} {version} does not take {', '.join(refused)}; use version={only}")
+
+
+def _motor_dofs(model: mujoco.MjModel) -> Int[np.ndarray, " motors"]:
+    """Ascending indices in `qvel` of the joints with a motor."""
+    is_on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    return np.unique(model.jnt_dofadr[model.actuator_trnid[is_on_joint, 0]])

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from mjx_walk.envs import Task
+from mjx_walk.utils.quiet_mujoco import hide_deprecations
 from mjx_walk.viewing.rendering import choose_opengl
 
 _CAMERA = {
@@ -116,7 +117,7 @@ def record_episode(
 def make_gymnasium(task: Task, **keywords: Any) -> gymnasium.Env:
     """Make the real Gymnasium environment of a task, with further keywords of `gymnasium.make`."""
     options = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
-    with warnings.catch_warnings():
+    with hide_deprecations(), warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
         return gymnasium.make(task.gymnasium_id, **options, **keywords)
 
