@@ -21,7 +21,7 @@ from mjx_walk.envs.inverted_pendulum import InvertedPendulum, InvertedPendulumOp
 from mjx_walk.envs.pusher import Pusher, PusherOptions
 from mjx_walk.envs.reacher import Reacher, ReacherOptions
 from mjx_walk.envs.swimmer import Swimmer, SwimmerOptions
-from mjx_walk.envs.task import NO_TIME_LIMIT, State, Task, TrainableTask
+from mjx_walk.envs.task import NO_TIME_LIMIT, State, Task, TrainableTask, View
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.utils.compat import prepare_jax
@@ -42,7 +42,7 @@ TASKS: dict[str, tuple[type[Task], type[TaskOptions]]] = {
     "inverted_double_pendulum": (InvertedDoublePendulum, InvertedDoublePendulumOptions),
 }
 
-__all__ = ["NO_TIME_LIMIT", "TASKS", "State", "Task", "TaskOptions", "TrainableTask", "make_env"]
+__all__ = ["NO_TIME_LIMIT", "TASKS", "State", "Task", "TaskOptions", "TrainableTask", "View", "make_env"]
 
 
 def make_env(name: str, physics: str = "auto", **kwargs: Any) -> Task:

@@ -16,9 +16,9 @@ _DETAIL_SECONDS = 3.0
 
 
 def draw_gait_sheet(episode: Episode, path: Path) -> Path:
-    """Draw a gait sheet: torso height and speed over the complete episode, and details from its middle.
+    """Draw a gait sheet: height and speed of the view's body over the complete episode, and details from its middle.
 
-    The details are frames over a second, and floor contacts, torques and reward terms over three seconds.
+    The details are frames over a second, and floor contacts, motors and reward terms over three seconds.
     """
     figure = matplotlib.figure.Figure(figsize=(12, 13), layout="constrained")
     grid = figure.add_gridspec(5, 2, height_ratios=[1.3, 1, 1, 1.2, 1.2])
@@ -29,15 +29,15 @@ def draw_gait_sheet(episode: Episode, path: Path) -> Path:
     figure.suptitle(f"{episode.env}: return {episode.rewards.sum():,.0f} in {length}")
     _frames(figure.add_subplot(grid[0, :]), episode, float(episode.seconds[start]))
     height = figure.add_subplot(grid[1, :])
-    height.plot(episode.seconds, episode.torso[:, 2])
-    height.set_ylabel("torso height (m)")
+    height.plot(episode.seconds, episode.body[:, 2])
+    height.set_ylabel(f"{episode.body_name} height (m)")
     speed = figure.add_subplot(grid[2, :], sharex=height)
-    speed.plot(episode.seconds[1:], np.diff(episode.torso[:, 0]) / episode.seconds_per_step)
-    speed.set_ylabel("torso speed forward (m/s)")
+    speed.plot(episode.seconds[1:], np.diff(episode.body[:, 0]) / episode.seconds_per_step)
+    speed.set_ylabel(f"{episode.body_name} speed along x (m/s)")
     speed.set_xlabel("seconds")
     _contacts(figure.add_subplot(grid[3, :]), episode, shown)
-    torques = dict(zip(_motor_names(episode.model), episode.torques.T, strict=True))
-    _lines(figure.add_subplot(grid[4, 0]), episode, shown, torques, "torque (N·m)")
+    forces = dict(zip(_motor_names(episode.model), episode.motor_forces.T, strict=True))
+    _lines(figure.add_subplot(grid[4, 0]), episode, shown, forces, "motor torque (N·m) or force (N)")
     _lines(figure.add_subplot(grid[4, 1]), episode, shown, episode.reward_terms, "reward term per step")
     for axes in figure.axes[1:]:
         axes.grid(alpha=0.3)
