@@ -46,7 +46,7 @@ class Pusher(Task):
     MISSING_VERSIONS = {"v4": "Gymnasium supports Pusher-v4 only with MuJoCo below 3"}
     REWARD_TERMS = {"v5": ("reward_dist", "reward_ctrl", "reward_near")}
     HAS_X = HAS_Y = False
-    VIEW = View(body=11, center=(0.4, -0.2, -0.2), distance=2.5, elevation=-45.0)
+    VIEW = View(body=11, center=(0.4, -0.2, -0.2), distance=2.2, elevation=-40.0, azimuth=200.0)
 
     options: PusherOptions
 

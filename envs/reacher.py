@@ -45,7 +45,7 @@ class Reacher(Task):
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_dist", "reward_ctrl"))
     V5_ONLY = (*Task.V5_ONLY, "reward_dist_weight", "reward_control_weight")
     HAS_X = HAS_Y = False
-    VIEW = View(body=3, center=(0.0, 0.0, 0.0), distance=0.8, elevation=-90.0)
+    VIEW = View(body=3, center=(0.0, 0.0, 0.0), distance=1.1, elevation=-90.0)
 
     options: ReacherOptions
 

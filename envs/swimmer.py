@@ -35,7 +35,7 @@ class Swimmer(Task):
     GYMNASIUM_NAME = "Swimmer"
     XML_FILES = {"v5": "swimmer.xml", "v4": "swimmer.xml"}
     REWARD_TERMS = {"v5": ("reward_forward", "reward_ctrl"), "v4": ("reward_fwd", "reward_ctrl")}
-    VIEW = View(elevation=-60.0)
+    VIEW = View(distance=8.0, elevation=-60.0)
 
     options: SwimmerOptions
 

@@ -90,6 +90,8 @@ class View(NamedTuple):
     """From the camera to its center, m."""
     elevation: float = -8.0
     """Angle of the line of sight above the horizon, degrees; -90 looks straight down."""
+    azimuth: float = 90.0
+    """Direction of the line of sight, degrees; 0 looks along x, 90 along y."""
 
 
 class Task(TrainableTask, abc.ABC):

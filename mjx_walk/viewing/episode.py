@@ -124,7 +124,11 @@ def make_gymnasium(task: Task, **keywords: Any) -> gymnasium.Env:
 
 def camera_settings(view: View) -> dict[str, Any]:
     """Fields of MuJoCo's camera for a view. Gymnasium 1.4's own default stands still and films an empty floor."""
-    settings: dict[str, Any] = {"distance": view.distance, "azimuth": 90.0, "elevation": view.elevation}
+    settings: dict[str, Any] = {
+        "distance": view.distance,
+        "azimuth": view.azimuth,
+        "elevation": view.elevation,
+    }
     if view.center is None:
         return settings | {"type": mujoco.mjtCamera.mjCAMERA_TRACKING, "trackbodyid": view.body}
     return settings | {"type": mujoco.mjtCamera.mjCAMERA_FREE, "lookat": np.array(view.center)}

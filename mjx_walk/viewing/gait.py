@@ -13,6 +13,8 @@ _NUM_FRAMES = 8
 _STRIP_SECONDS = 1.0
 _DETAIL_SECONDS = 3.0
 """Time shown of contacts, torques and reward terms, which repeat many times in an episode."""
+_NO_HEIGHT = 1e-6
+"""Range of heights below which a body moves in a horizontal plane, m. Then its y is drawn instead."""
 
 
 def draw_gait_sheet(episode: Episode, path: Path) -> Path:
@@ -29,8 +31,9 @@ def draw_gait_sheet(episode: Episode, path: Path) -> Path:
     figure.suptitle(f"{episode.env}: return {episode.rewards.sum():,.0f} in {length}")
     _frames(figure.add_subplot(grid[0, :]), episode, float(episode.seconds[start]))
     height = figure.add_subplot(grid[1, :])
-    height.plot(episode.seconds, episode.body[:, 2])
-    height.set_ylabel(f"{episode.body_name} height (m)")
+    moves_in_plane = np.ptp(episode.body[:, 2]) < _NO_HEIGHT
+    height.plot(episode.seconds, episode.body[:, 1 if moves_in_plane else 2])
+    height.set_ylabel(f"{episode.body_name} {'y' if moves_in_plane else 'height'} (m)")
     speed = figure.add_subplot(grid[2, :], sharex=height)
     speed.plot(episode.seconds[1:], np.diff(episode.body[:, 0]) / episode.seconds_per_step)
     speed.set_ylabel(f"{episode.body_name} speed along x (m/s)")
@@ -80,7 +83,7 @@ def _contacts(axes: Axes, episode: Episode, shown: slice) -> None:
         axes.broken_barh([(t, episode.seconds_per_step) for t in edges[touching]], (line - 0.4, 0.8))
     axes.set_yticks(range(len(bodies)), [episode.model.body(body).name for body in bodies])
     axes.set_xlim(edges[0], edges[-1])
-    axes.set_title("floor contacts", fontsize=9)
+    axes.set_title("floor contacts" if bodies else "no floor contacts", fontsize=9)
 
 
 def _lines(axes: Axes, episode: Episode, shown: slice, series: dict[str, np.ndarray], ylabel: str) -> None:

@@ -72,14 +72,13 @@ def _camera(episode: Episode) -> dict[str, Any]:
     The point moves with the body if the view follows it; then it is at 0.6 of the body's greatest height. Places are in
     three.js's coordinates: x to the right, y up, z towards the viewer.
     """
-    view, elevation = episode.view, np.deg2rad(episode.view.elevation)
-    if view == View():
-        eye, center = (0.5, 0.7, 3.2), None
-    else:
-        eye = (0.0, -view.distance * float(np.sin(elevation)), view.distance * float(np.cos(elevation)))
-        center = view.center
+    view = episode.view
+    azimuth, elevation = np.deg2rad((view.azimuth, view.elevation))
+    sight = np.array((np.cos(elevation) * np.cos(azimuth), np.sin(elevation), -np.cos(elevation) * np.sin(azimuth)))
+    eye = np.array((0.5, 0.7, 3.2)) if view == View() else -view.distance * sight
+    center = view.center
     height = float(episode.body[:, 2].max()) * 0.6 if center is None else center[2]
-    return {"eye": _rounded(np.array(eye)), "center": center and [*center[:2]], "eye_height": round(height, 3)}
+    return {"eye": _rounded(eye), "center": center and [*center[:2]], "eye_height": round(height, 3)}
 
 
 def _inside_script(text: str) -> str:
