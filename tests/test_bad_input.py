@@ -29,7 +29,7 @@ CASES = [
     (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo, sac, csac, td3, ddpg, a2c, reinforce"),
     (["physics=bullet"], "physics=bullet: choose one of: auto, warp, jax, c"),
     (["env.version=v3"], "env.version=v3: choose one of: v5, v4"),
-    (["recipe=nope"], "recipes: cpu/humanoid_a2c"),
+    (["recipe=nope"], "recipes for env=humanoid algo=ppo: cpu/humanoid_ppo, gpu/humanoid_ppo"),
     (["recipe=report/e_td3", "algo=sac"], "this recipe does not fit the given env and algo"),
     (["device=2"], "unknown key 'device'; did you mean: devices?"),
     (["seedz=2"], "unknown key 'seedz'; did you mean: seed, seeds?"),
