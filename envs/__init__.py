@@ -20,8 +20,9 @@ from mjx_walk.envs.inverted_double_pendulum import InvertedDoublePendulum, Inver
 from mjx_walk.envs.inverted_pendulum import InvertedPendulum, InvertedPendulumOptions
 from mjx_walk.envs.pusher import Pusher, PusherOptions
 from mjx_walk.envs.reacher import Reacher, ReacherOptions
+from mjx_walk.envs.state import NO_TIME_LIMIT, State, TrainableTask
 from mjx_walk.envs.swimmer import Swimmer, SwimmerOptions
-from mjx_walk.envs.task import NO_TIME_LIMIT, State, Task, TrainableTask, View
+from mjx_walk.envs.task import Task, View
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.utils.compat import prepare_jax

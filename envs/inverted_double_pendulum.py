@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_normal_velocity
 from mjx_walk.envs.reward_shaping import Terms
-from mjx_walk.envs.task import Carry, State, Task, View
+from mjx_walk.envs.state import Carry, State
+from mjx_walk.envs.task import Task, View
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.settings import setting
 

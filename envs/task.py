@@ -1,9 +1,8 @@
-"""The contract of a task, and what all Gymnasium tasks share: model, engine, resets, finiteness check, time limit."""
+"""What all Gymnasium tasks share: model, engine, resets, finiteness check, time limit."""
 
 import abc
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
-import flax
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -15,68 +14,15 @@ from mjx_walk.envs.models import load_model
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, load_reward_function, shaping_terms, term_names
+from mjx_walk.envs.state import Carry, State, TrainableTask
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.errors import UserError
 
 MAX_ABS_VALUE = 1e10
 """Largest valid position or velocity, as in MuJoCo's own check (`mjMAXVAL`)."""
 
-NO_TIME_LIMIT = 2**31 - 1
-"""Value of `max_episode_steps` when a caller or a wrapper applies the time limit."""
-
-Carry = dict[str, Array]
-"""Quantities of one step that the next step's reward needs, in addition to the physics state."""
-
 _NOT_IN_GYMNASIUM = ("name", "version", "max_episode_steps", "shaping", "reward_function")
 """Fields of `TaskOptions` that the constructors of Gymnasium's classes do not take."""
-
-
-class State(flax.struct.PyTreeNode):
-    """State of one environment. It holds no MuJoCo data: the engine rebuilds them in each step."""
-
-    physics: PhysicsState
-    memory: Carry
-    """The task's carry. Checkpoints store it under this name."""
-    obs: Array
-    """`[observation_size] f32`, in Gymnasium's order and units."""
-    reward: Array
-    """`[] f32`."""
-    terminated: Array
-    """`[] bool`: the task ended the episode, so no reward follows."""
-    truncated: Array
-    """`[] bool`: the episode reached the time limit."""
-    steps: Array
-    """`[] i32`: steps since the reset."""
-    metrics: dict[str, Array]
-    """`[] f32` each: the reward terms under the names of Gymnasium's `info`, `nonfinite` and `overflow`."""
-
-
-class TrainableTask(Protocol):
-    """What a trainer needs of a task. All methods are pure functions of one unbatched environment."""
-
-    observation_size: int
-    action_size: int
-    action_low: Array
-    """`[action_size] f32`, in Gymnasium's units."""
-    action_high: Array
-    """`[action_size] f32`, in Gymnasium's units."""
-    reward_terms: tuple[str, ...]
-    """Names of the reward terms in `State.metrics`."""
-    max_episode_steps: int
-    """Time limit, after which `State.truncated` is set."""
-
-    def reset(self, key: PRNGKeyArray) -> State:
-        """Random initial state."""
-        ...
-
-    def step(self, state: State, action: Float[Array, " action_size"]) -> State:
-        """Next state. Its metrics hold the reward terms, `nonfinite` and `overflow`."""
-        ...
-
-    def scale_action(self, action: Float[Array, "*batch action_size"]) -> Float[Array, "*batch action_size"]:
-        """Actions in Gymnasium's units, from actions in [-1, 1]; values outside that range are clipped."""
-        center = (self.action_high + self.action_low) / 2
-        return center + (self.action_high - self.action_low) / 2 * jnp.clip(action, -1.0, 1.0)
 
 
 class View(NamedTuple):
