@@ -74,6 +74,9 @@ class Ant(Task):
     def initial_state(self, key: PRNGKeyArray) -> InitialState:
         return with_normal_velocity(key, self.init_qpos, self.init_qvel, self.options.reset_noise_scale)
 
+    def named_bodies(self) -> tuple[int | str, ...]:
+        return (self.options.main_body if self.options.version == "v5" else "torso",)
+
     def derived_names(self) -> tuple[str, ...]:
         return ("xpos", "cfrc_ext") if self._has_contact_cost else ("xpos",)
 
@@ -101,7 +104,8 @@ class Ant(Task):
 
     def carry(self, physics: PhysicsState, derived: Derived) -> Carry:
         """Position of the main body `[2]`, x and y in m. The next step's velocity is its displacement."""
-        return {"main_body": derived["xpos"][self.model.body(self.options.main_body).id, :2]}
+        (body,) = self.body_ids.values()
+        return {"main_body": derived["xpos"][body, :2]}
 
     def reward_and_termination(
         self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]

@@ -67,6 +67,9 @@ class Pusher(Task):
         qpos = self.init_qpos.at[-4:-2].set(position).at[-2:].set(0.0)
         return qpos, self.init_qvel.at[:NUM_JOINTS].add(velocities).at[-4:].set(0.0)
 
+    def named_bodies(self) -> tuple[int | str, ...]:
+        return ("tips_arm", "object", "goal")
+
     def derived_names(self) -> tuple[str, ...]:
         return ("xpos",)
 
@@ -75,17 +78,17 @@ class Pusher(Task):
 
     def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
         """Observation `[23]`: joint angles, joint velocities, and the positions of fingertip, object and goal."""
-        positions = (self._position(derived, body) for body in ("tips_arm", "object", "goal"))
-        return jnp.concatenate([physics.qpos[:NUM_JOINTS], physics.qvel[:NUM_JOINTS], *positions])
+        return jnp.concatenate([physics.qpos[:NUM_JOINTS], physics.qvel[:NUM_JOINTS], *self._positions(derived)])
 
-    def _position(self, derived: Derived, body: str) -> Float[Array, "3"]:
-        return derived["xpos"][self.model.body(body).id]
+    def _positions(self, derived: Derived) -> list[Float[Array, "3"]]:
+        """Positions of fingertip, object and goal, m."""
+        return [derived["xpos"][body] for body in self.body_ids.values()]
 
     def reward_and_termination(
         self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
     ) -> tuple[Terms, Float[Array, ""], Bool[Array, ""]]:
         options = self.options
-        tip, pushed, goal = (self._position(derived, body) for body in ("tips_arm", "object", "goal"))
+        tip, pushed, goal = self._positions(derived)
         terms = {
             "reward_dist": -options.reward_dist_weight * jnp.linalg.norm(pushed - goal),
             "reward_ctrl": -options.reward_control_weight * jnp.square(action).sum(),

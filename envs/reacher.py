@@ -62,6 +62,9 @@ class Reacher(Task):
         qpos = jnp.concatenate([self.init_qpos[:2] + angles, target])
         return qpos, jnp.concatenate([self.init_qvel[:2] + velocities, jnp.zeros(2)])
 
+    def named_bodies(self) -> tuple[int | str, ...]:
+        return ("fingertip", "target")
+
     def derived_names(self) -> tuple[str, ...]:
         return ("xpos",)
 
@@ -81,7 +84,7 @@ class Reacher(Task):
     def _to_target(self, derived: Derived) -> Float[Array, "3"]:
         """Position of the fingertip relative to the target, m."""
         xpos = derived["xpos"]
-        return xpos[self.model.body("fingertip").id] - xpos[self.model.body("target").id]
+        return xpos[self.body_ids["fingertip"]] - xpos[self.body_ids["target"]]
 
     def carry(self, physics: PhysicsState, derived: Derived) -> Carry:
         """In v4, the fingertip's position relative to the target `[3]`, m: v4 rewards the position before the step."""

@@ -5,12 +5,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Bool, Float, PRNGKeyArray
 
-from mjx_walk.envs.models import load_model
+from mjx_walk.envs.models import body_id, load_model, motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, load_reward_function, shaping_terms, term_names
@@ -73,8 +72,8 @@ class Task(TrainableTask, abc.ABC):
             physics: name of the engine, or `auto`.
 
         Raises:
-            UserError: an unknown version or engine, an option that v4 does not take, shaping that has no effect, or a
-                model file or reward function that is missing or invalid.
+            UserError: an unknown version or engine, an option that the version does not take, shaping that has no
+                effect, a model file or reward function that is missing or invalid, or a body that the model lacks.
         """
         _check_version(self, options)
         self.options = options
@@ -85,10 +84,11 @@ class Task(TrainableTask, abc.ABC):
         low, high = self.model.actuator_ctrlrange.T
         self.action_low, self.action_high = jnp.float32(low), jnp.float32(high)
         self.action_size = self.model.nu
+        self.body_ids = {body: body_id(self.model, body) for body in self.named_bodies()}
         self.init_qpos = jnp.asarray(self.model.qpos0, jnp.float32)
         self.init_qvel = jnp.zeros(self.model.nv, jnp.float32)
         self.observation_size = sum(self.observation_blocks().values())
-        self._motor_dofs = _motor_dofs(self.model)
+        self._motor_dofs = motor_dofs(self.model)
         self._check_shaping()
         self._reward_function = load_reward_function(options.reward_function) if options.reward_function else None
         self.reward_terms = self._reward_term_names()
@@ -128,6 +128,10 @@ class Task(TrainableTask, abc.ABC):
     def terminates_on_fall(self) -> bool:
         """Whether a fall terminates the episode."""
         return False
+
+    def named_bodies(self) -> tuple[int | str, ...]:
+        """Bodies that `observe`, `carry` and `reward_and_termination` read, as keys of `body_ids`."""
+        return ()
 
     @abc.abstractmethod
     def initial_state(self, key: PRNGKeyArray) -> InitialState:
@@ -284,9 +288,3 @@ def _check_version(task: Task, options: TaskOptions) -> None:
         refused = [option for option in names if option in options.changed()]
         if version == other and refused:
             raise UserError(f"{name} {version} does not take {', '.join(refused)}; use version={only}")
-
-
-def _motor_dofs(model: mujoco.MjModel) -> Int[np.ndarray, " motors"]:
-    """Ascending indices in `qvel` of the joints with a motor."""
-    is_on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-    return np.unique(model.jnt_dofadr[model.actuator_trnid[is_on_joint, 0]])
