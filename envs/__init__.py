@@ -1,4 +1,4 @@
-"""Gymnasium's Humanoid, HumanoidStandup and Walker2d as pure functions, with their rewards and vectorization.
+"""Gymnasium's MuJoCo tasks as pure functions, with their rewards and vectorization.
 
 Reset, step, autoreset and evaluation in the training batch belong here, and the physics engines in `physics/`.
 Policies, learning and other libraries' environment interfaces (`interop`) do not.
@@ -12,9 +12,19 @@ import difflib
 from pathlib import Path
 from typing import Any
 
+from mjx_walk.envs.ant import Ant, AntOptions
+from mjx_walk.envs.half_cheetah import HalfCheetah, HalfCheetahOptions
+from mjx_walk.envs.hopper import Hopper, HopperOptions
 from mjx_walk.envs.humanoid import Humanoid, HumanoidOptions
 from mjx_walk.envs.humanoid_standup import HumanoidStandup, HumanoidStandupOptions
-from mjx_walk.envs.task import NO_TIME_LIMIT, State, Task, TaskOptions, TrainableTask, with_absolute_paths
+from mjx_walk.envs.inverted_double_pendulum import InvertedDoublePendulum, InvertedDoublePendulumOptions
+from mjx_walk.envs.inverted_pendulum import InvertedPendulum, InvertedPendulumOptions
+from mjx_walk.envs.pusher import Pusher, PusherOptions
+from mjx_walk.envs.reacher import Reacher, ReacherOptions
+from mjx_walk.envs.state import NO_TIME_LIMIT, State, TrainableTask
+from mjx_walk.envs.swimmer import Swimmer, SwimmerOptions
+from mjx_walk.envs.task import Task, View
+from mjx_walk.envs.task_options import TaskOptions, with_absolute_paths
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.utils.compat import prepare_jax
 from mjx_walk.utils.errors import UserError
@@ -24,16 +34,34 @@ TASKS: dict[str, tuple[type[Task], type[TaskOptions]]] = {
     "humanoid": (Humanoid, HumanoidOptions),
     "humanoid_standup": (HumanoidStandup, HumanoidStandupOptions),
     "walker2d": (Walker2d, Walker2dOptions),
+    "ant": (Ant, AntOptions),
+    "half_cheetah": (HalfCheetah, HalfCheetahOptions),
+    "hopper": (Hopper, HopperOptions),
+    "swimmer": (Swimmer, SwimmerOptions),
+    "reacher": (Reacher, ReacherOptions),
+    "pusher": (Pusher, PusherOptions),
+    "inverted_pendulum": (InvertedPendulum, InvertedPendulumOptions),
+    "inverted_double_pendulum": (InvertedDoublePendulum, InvertedDoublePendulumOptions),
 }
 
-__all__ = ["NO_TIME_LIMIT", "TASKS", "State", "Task", "TaskOptions", "TrainableTask", "make_env", "with_absolute_paths"]
+__all__ = [
+    "NO_TIME_LIMIT",
+    "TASKS",
+    "State",
+    "Task",
+    "TaskOptions",
+    "TrainableTask",
+    "View",
+    "make_env",
+    "with_absolute_paths",
+]
 
 
 def make_env(name: str, physics: str = "auto", **kwargs: Any) -> Task:
     """Create one unbatched environment.
 
     Args:
-        name: `humanoid`, `humanoid_standup` or `walker2d`.
+        name: a key of `TASKS`, such as `humanoid`.
         physics: `auto`, `warp`, `jax` or `c`.
         **kwargs: env options: `version` (`v5` or `v4`), `max_episode_steps`, `shaping`, `reward_function`, and the
             keyword arguments of the Gymnasium class.

@@ -5,10 +5,13 @@ import dataclasses
 import jax.numpy as jnp
 import mujoco
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, PRNGKeyArray
 
 from mjx_walk.envs.physics import Derived, PhysicsState
-from mjx_walk.envs.task import Task, TaskOptions
+from mjx_walk.envs.resets import InitialState, with_uniform_noise
+from mjx_walk.envs.task import Task
+from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.utils.settings import setting
 
 NUM_ROOT_DOFS = 6
 """Degrees of freedom of the root's free joint, which has no motor."""
@@ -16,8 +19,10 @@ NUM_ROOT_DOFS = 6
 
 @dataclasses.dataclass
 class HumanoidBodyOptions(TaskOptions):
-    """Gymnasium's observation flags, which v4 does not take."""
+    """Keyword arguments of both humanoids. v4 does not take the flags `include_…`."""
 
+    reset_noise_scale: float = setting(1e-2, at_least=0)
+    exclude_current_positions_from_observation: bool = True
     include_cinert_in_observation: bool = True
     include_cvel_in_observation: bool = True
     include_qfrc_actuator_in_observation: bool = True
@@ -35,7 +40,12 @@ class HumanoidBody(Task):
         "include_cfrc_ext_in_observation",
     )
 
+    HEIGHT_INDEX = 2
+
     options: HumanoidBodyOptions
+
+    def initial_state(self, key: PRNGKeyArray) -> InitialState:
+        return with_uniform_noise(key, self.init_qpos, self.init_qvel, self.options.reset_noise_scale)
 
     def observed_arrays(self) -> tuple[str, ...]:
         """Names of the `mjData` arrays that the observation holds after positions and velocities, in order."""

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from mjx_walk.envs.humanoid_body import HumanoidBody, HumanoidBodyOptions
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.reward_shaping import Terms
-from mjx_walk.envs.task import Carry, State
+from mjx_walk.envs.state import Carry, State
 from mjx_walk.utils.settings import setting
 
 

@@ -12,7 +12,8 @@ import flax
 import jax
 import jax.numpy as jnp
 
-from mjx_walk.envs.task import State, Task
+from mjx_walk.envs.state import State
+from mjx_walk.envs.task import Task
 from mjx_walk.utils.settings import setting
 from mjx_walk.utils.types import ITERATION_COUNT, Metric, Metrics, PolicyFn, Reduction
 

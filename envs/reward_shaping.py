@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.utils.errors import UserError
@@ -47,22 +48,28 @@ class Shaping:
     """Weights of additional reward terms; 0 disables a term. x points forward, y to the left."""
 
     keep_y: float = setting(0.0, at_least=0)
-    """`exp(-y²)` with y in m, which rewards walking straight. Walker2d has no y."""
+    """`exp(-y²)` with y in m, which rewards walking straight. Bodies that move in a plane have no y."""
     shaking: float = setting(0.0, at_least=0)
-    """Minus the mean squared velocity of the joints with a motor, (rad/s)²."""
+    """Minus the mean squared velocity of the joints with a motor, (rad/s)² or, for a slider, (m/s)²."""
     falling: float = setting(0.0, at_least=0)
     """-1 in the step that terminates the episode."""
     backward: float = setting(0.0, at_least=0)
     """Minus the root's backward speed, m/s."""
 
 
-def shaping_terms(shaping: Shaping, step: RewardStep) -> Terms:
-    """Weighted shaping terms of a step, without the disabled ones."""
+def shaping_terms(shaping: Shaping, step: RewardStep, motor_dofs: Int[np.ndarray, " motors"]) -> Terms:
+    """Weighted shaping terms of a step, without the disabled ones.
+
+    Args:
+        shaping: weights.
+        step: the step.
+        motor_dofs: indices in `qvel` of the joints with a motor.
+    """
     terms = {}
     if shaping.keep_y:
         terms["reward_keep_y"] = shaping.keep_y * jnp.exp(-jnp.square(step.after.qpos[1]))
     if shaping.shaking:
-        terms["reward_shaking"] = shaping.shaking * -jnp.square(step.after.qvel[-step.action.size :]).mean()
+        terms["reward_shaking"] = shaping.shaking * -jnp.square(step.after.qvel[motor_dofs]).mean()
     if shaping.falling:
         terms["reward_falling"] = shaping.falling * -jnp.float32(step.terminated)
     if shaping.backward:

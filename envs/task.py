@@ -1,117 +1,43 @@
-"""The contract of a task, and what all Gymnasium tasks share: model, engine, resets, finiteness check, time limit."""
+"""What all Gymnasium tasks share: model, engine, resets, finiteness check, time limit."""
 
 import abc
-import dataclasses
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
-import flax
-import gymnasium
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.models import body_id, load_model, motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
-from mjx_walk.envs.reward_files import absolute_source, load_reward_function
-from mjx_walk.envs.reward_shaping import RewardStep, Shaping, Terms, shaping_terms, term_names
+from mjx_walk.envs.resets import InitialState
+from mjx_walk.envs.reward_files import load_reward_function
+from mjx_walk.envs.reward_shaping import RewardStep, Terms, shaping_terms, term_names
+from mjx_walk.envs.state import Carry, State, TrainableTask
+from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import setting
 
 MAX_ABS_VALUE = 1e10
 """Largest valid position or velocity, as in MuJoCo's own check (`mjMAXVAL`)."""
-
-NO_TIME_LIMIT = 2**31 - 1
-"""Value of `max_episode_steps` when a caller or a wrapper applies the time limit."""
-
-Carry = dict[str, Array]
-"""Quantities of one step that the next step's reward needs, in addition to the physics state."""
 
 _NOT_IN_GYMNASIUM = ("name", "version", "max_episode_steps", "shaping", "reward_function")
 """Fields of `TaskOptions` that the constructors of Gymnasium's classes do not take."""
 
 
-class State(flax.struct.PyTreeNode):
-    """State of one environment. It holds no MuJoCo data: the engine rebuilds them in each step."""
+class View(NamedTuple):
+    """What films, pages and gait sheets show of a task."""
 
-    physics: PhysicsState
-    memory: Carry
-    """The task's carry. Checkpoints store it under this name."""
-    obs: Array
-    """`[observation_size] f32`, in Gymnasium's order and units."""
-    reward: Array
-    """`[] f32`."""
-    terminated: Array
-    """`[] bool`: the task ended the episode, so no reward follows."""
-    truncated: Array
-    """`[] bool`: the episode reached the time limit."""
-    steps: Array
-    """`[] i32`: steps since the reset."""
-    metrics: dict[str, Array]
-    """`[] f32` each: the reward terms under the names of Gymnasium's `info`, `nonfinite` and `overflow`."""
-
-
-class TrainableTask(Protocol):
-    """What a trainer needs of a task. All methods are pure functions of one unbatched environment."""
-
-    observation_size: int
-    action_size: int
-    action_low: Array
-    """`[action_size] f32`, in Gymnasium's units."""
-    action_high: Array
-    """`[action_size] f32`, in Gymnasium's units."""
-    reward_terms: tuple[str, ...]
-    """Names of the reward terms in `State.metrics`."""
-    max_episode_steps: int
-    """Time limit, after which `State.truncated` is set."""
-
-    def reset(self, key: PRNGKeyArray) -> State:
-        """Random initial state."""
-        ...
-
-    def step(self, state: State, action: Float[Array, " action_size"]) -> State:
-        """Next state. Its metrics hold the reward terms, `nonfinite` and `overflow`."""
-        ...
-
-    def scale_action(self, action: Float[Array, "*batch action_size"]) -> Float[Array, "*batch action_size"]:
-        """Actions in Gymnasium's units, from actions in [-1, 1]; values outside that range are clipped."""
-        center = (self.action_high + self.action_low) / 2
-        return center + (self.action_high - self.action_low) / 2 * jnp.clip(action, -1.0, 1.0)
-
-
-@dataclasses.dataclass
-class TaskOptions:
-    """Env options of all tasks. Subclasses add the keyword arguments of their Gymnasium class."""
-
-    name: str = ""
-    version: str = setting("v5", choices=("v5", "v4"))
-    xml_file: str | None = None
-    """Model file: a path, or the name of one of Gymnasium's assets. Default: the version's own model."""
-    frame_skip: int = setting(5, at_least=1)
-    reset_noise_scale: float = setting(1e-2, at_least=0)
-    exclude_current_positions_from_observation: bool = True
-    max_episode_steps: int = setting(1000, at_least=1, at_most=NO_TIME_LIMIT)
-    shaping: Shaping = dataclasses.field(default_factory=Shaping)
-    """Weights of additional reward terms."""
-    reward_function: str | None = None
-    """`PATH.py:FUNCTION`, a custom reward that replaces Gymnasium's; see `mjx_walk.envs.reward_shaping`."""
-
-    def __post_init__(self):
-        for name, value in list(vars(self).items()):
-            if isinstance(value, list):  # a configuration file gives a range as a list
-                setattr(self, name, tuple(value))
-        if isinstance(self.shaping, dict):
-            unknown = self.shaping.keys() - {field.name for field in dataclasses.fields(Shaping)}
-            if unknown:
-                raise UserError(f"unknown key 'env.shaping.{min(unknown)}'")
-            self.shaping = Shaping(**self.shaping)
-
-    def changed(self) -> dict[str, Any]:
-        """Options that differ from their defaults."""
-        defaults = vars(type(self)())
-        return {name: value for name, value in vars(self).items() if value != defaults[name]}
+    body: int = 1
+    """Body whose height and speed they show. In Gymnasium's models, body 1 is the root, and the world is body 0."""
+    center: tuple[float, float, float] | None = None
+    """Point that the camera looks at, m. Default: the camera follows the body."""
+    distance: float = 4.0
+    """From the camera to its center, m."""
+    elevation: float = -8.0
+    """Angle of the line of sight above the horizon, degrees; -90 looks straight down."""
+    azimuth: float = 90.0
+    """Direction of the line of sight, degrees; 0 looks along x, 90 along y."""
 
 
 class Task(TrainableTask, abc.ABC):
@@ -128,8 +54,17 @@ class Task(TrainableTask, abc.ABC):
     """Signed reward terms of each version, under the names of Gymnasium's `info`."""
     V5_ONLY: tuple[str, ...] = ("xml_file", "frame_skip")
     """Env options that Gymnasium's v4 class does not take."""
+    V4_ONLY: tuple[str, ...] = ()
+    """Env options that Gymnasium's v5 class does not take."""
+    MISSING_VERSIONS: dict[str, str] = {}
+    """Why a version is not available, by version."""
+    HAS_X: bool = True
+    """Whether `qpos[0]` is the root's forward coordinate x."""
     HAS_Y: bool = True
-    """Whether `qpos[1]` is the lateral coordinate y."""
+    """Whether `qpos[1]` is the root's lateral coordinate y."""
+    HEIGHT_INDEX: int | None = None
+    """Index of the root's height in `qpos`. None: the root cannot leave the ground."""
+    VIEW: View = View()
 
     def __init__(self, options: TaskOptions, physics: str = "auto"):
         """
@@ -138,15 +73,10 @@ class Task(TrainableTask, abc.ABC):
             physics: name of the engine, or `auto`.
 
         Raises:
-            UserError: an unknown version or engine, an option that v4 does not take, shaping that has no effect, or a
-                model file or reward function that is missing or invalid.
+            UserError: an unknown version or engine, an option that the version does not take, shaping that has no
+                effect, a model file or reward function that is missing or invalid, or a body that the model lacks.
         """
-        if options.version not in self.XML_FILES:
-            raise UserError(f"unknown version '{options.version}' of {options.name}; choose one of: v5, v4")
-        changed = options.changed()
-        not_in_v4 = [name for name in self.V5_ONLY if name in changed]
-        if options.version == "v4" and not_in_v4:
-            raise UserError(f"{options.name} v4 does not take {', '.join(not_in_v4)}; use version=v5")
+        _check_version(self, options)
         self.options = options
         self.max_episode_steps = options.max_episode_steps
         self.model = load_model(options.xml_file or self.XML_FILES[options.version])
@@ -155,9 +85,11 @@ class Task(TrainableTask, abc.ABC):
         low, high = self.model.actuator_ctrlrange.T
         self.action_low, self.action_high = jnp.float32(low), jnp.float32(high)
         self.action_size = self.model.nu
+        self.body_ids = {body: body_id(self.model, body) for body in self.named_bodies()}
         self.init_qpos = jnp.asarray(self.model.qpos0, jnp.float32)
         self.init_qvel = jnp.zeros(self.model.nv, jnp.float32)
         self.observation_size = sum(self.observation_blocks().values())
+        self._motor_dofs = motor_dofs(self.model)
         self._check_shaping()
         self._reward_function = load_reward_function(options.reward_function) if options.reward_function else None
         self.reward_terms = self._reward_term_names()
@@ -165,6 +97,8 @@ class Task(TrainableTask, abc.ABC):
 
     def _check_shaping(self) -> None:
         name, shaping = self.options.name, self.options.shaping
+        if shaping.backward and not self.HAS_X:
+            raise UserError(f"env.shaping.backward={shaping.backward}: {name} has no x coordinate; set it to 0")
         if shaping.keep_y and not self.HAS_Y:
             raise UserError(f"env.shaping.keep_y={shaping.keep_y}: {name} has no y coordinate; set it to 0")
         if shaping.falling and not self.terminates_on_fall:
@@ -185,6 +119,11 @@ class Task(TrainableTask, abc.ABC):
         return self._reward_function.hashes if self._reward_function else {}
 
     @property
+    def gymnasium_reward_terms(self) -> tuple[str, ...]:
+        """Names of the terms of Gymnasium's reward."""
+        return self.REWARD_TERMS[self.options.version]
+
+    @property
     def has_custom_reward(self) -> bool:
         """Whether the reward differs from Gymnasium's."""
         return self._reward_function is not None or any(vars(self.options.shaping).values())
@@ -195,6 +134,14 @@ class Task(TrainableTask, abc.ABC):
     def terminates_on_fall(self) -> bool:
         """Whether a fall terminates the episode."""
         return False
+
+    def named_bodies(self) -> tuple[int | str, ...]:
+        """Bodies that `observe`, `carry` and `reward_and_termination` read, as keys of `body_ids`."""
+        return ()
+
+    @abc.abstractmethod
+    def initial_state(self, key: PRNGKeyArray) -> InitialState:
+        """Draw the position and velocity of a reset. Source: `reset_model` of the Gymnasium class."""
 
     @abc.abstractmethod
     def derived_names(self) -> tuple[str, ...]:
@@ -232,12 +179,8 @@ class Task(TrainableTask, abc.ABC):
     # Shared by all tasks.
 
     def reset(self, key: PRNGKeyArray) -> State:
-        """Random initial state. Source: `reset_model` of the Gymnasium classes, uniform noise on the model's pose."""
-        qpos_key, qvel_key = jax.random.split(key)
-        scale = self.options.reset_noise_scale
-        qpos_noise = jax.random.uniform(qpos_key, self.init_qpos.shape, minval=-scale, maxval=scale)
-        qvel_noise = jax.random.uniform(qvel_key, self.init_qvel.shape, minval=-scale, maxval=scale)
-        return self.reset_to(self.init_qpos + qpos_noise, self.init_qvel + qvel_noise)
+        """Random initial state, drawn by `initial_state`."""
+        return self.reset_to(*self.initial_state(key))
 
     def reset_to(
         self,
@@ -316,16 +259,16 @@ class Task(TrainableTask, abc.ABC):
         if self._reward_function:
             terms = {name: jnp.float32(term) for name, term in self._reward_function(step).items()}
             reward = sum(terms.values(), jnp.float32(0.0))
-        added = shaping_terms(self.options.shaping, step)
+        added = shaping_terms(self.options.shaping, step, self._motor_dofs)
         return terms | added, sum(added.values(), reward)
 
     def _reward_term_names(self) -> tuple[str, ...]:
         """Names of all reward terms, found by tracing `reward_function` on an example step."""
-        terms = dict.fromkeys(self.REWARD_TERMS[self.options.version], jnp.float32(0.0))
+        terms = dict.fromkeys(self.gymnasium_reward_terms, jnp.float32(0.0))
         physics = PhysicsState(self.init_qpos, self.init_qvel, self.init_qvel)
         obs, action = jnp.zeros(self.observation_size), jnp.zeros(self.action_size)
         step = RewardStep(terms, jnp.float32(0.0), physics, physics, obs, action, jnp.zeros((), bool), self.dt)
-        names, shaped = tuple(terms), shaping_terms(self.options.shaping, step)
+        names, shaped = tuple(terms), shaping_terms(self.options.shaping, step, self._motor_dofs)
         if self._reward_function:
             names = term_names(self._reward_function, str(self.options.reward_function), step, shaped)
         return (*names, *shaped)
@@ -336,41 +279,18 @@ def _is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[
     return jnp.array([jnp.all(jnp.abs(x) < limit) for x in arrays]).all()
 
 
-def _model_path(xml_file: str) -> Path:
-    """Path of a model. A bare name is one of Gymnasium's assets, even if the working directory has such a file."""
-    path = Path(xml_file).expanduser()
-    if len(path.parts) == 1:
-        return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / xml_file
-    return path
-
-
-def with_absolute_paths(options: TaskOptions, folder: Path) -> TaskOptions:
-    """Options whose files stay the same ones when a run is loaded from another working directory.
-
-    Args:
-        options: env options as a user gives them.
-        folder: what a relative path is relative to.
-    """
-    xml_file, source = options.xml_file, options.reward_function
-    if xml_file and (folder / Path(xml_file).expanduser()).is_file():
-        xml_file = str((folder / Path(xml_file).expanduser()).resolve())
-    source = absolute_source(source, folder) if source else source
-    return dataclasses.replace(options, xml_file=xml_file, reward_function=source)
-
-
-def load_model(xml_file: str) -> mujoco.MjModel:
-    """Load a MuJoCo model.
-
-    Args:
-        xml_file: name of one of Gymnasium's assets, or a path.
+def _check_version(task: Task, options: TaskOptions) -> None:
+    """Check that Gymnasium has the version, and that its class takes the options that differ from their defaults.
 
     Raises:
-        UserError: the file does not exist, or MuJoCo cannot read it.
+        UserError: it does not.
     """
-    path = _model_path(xml_file)
-    if not path.is_file():
-        raise UserError(f"model file not found: {path}")
-    try:
-        return mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise UserError(f"MuJoCo cannot read {path}: {str(error).splitlines()[0]}") from error
+    name, version = options.name, options.version
+    if version not in task.XML_FILES:
+        reason = task.MISSING_VERSIONS.get(version, f"unknown version '{version}' of {name}")
+        raise UserError(f"{reason}; choose one of: {', '.join(task.XML_FILES)}")
+    for only, other in (("v5", "v4"), ("v4", "v5")):
+        names = task.V5_ONLY if only == "v5" else task.V4_ONLY
+        refused = [option for option in names if option in options.changed()]
+        if version == other and refused:
+            raise UserError(f"{name} {version} does not take {', '.join(refused)}; use version={only}")

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from mjx_walk.envs.inline_evaluation import InlineEvaluation, InlineEvaluator
-from mjx_walk.envs.task import State, Task
+from mjx_walk.envs.state import State
+from mjx_walk.envs.task import Task
 from mjx_walk.utils.types import Metric, Metrics, Reduction
 
 

@@ -4,11 +4,14 @@ import dataclasses
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs.physics import Derived, PhysicsState
+from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
-from mjx_walk.envs.task import Carry, State, Task, TaskOptions
+from mjx_walk.envs.state import Carry, State
+from mjx_walk.envs.task import Task
+from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.settings import setting
 
 MAX_OBSERVED_VELOCITY = 10.0
@@ -22,6 +25,7 @@ class Walker2dOptions(TaskOptions):
     name: str = setting("walker2d", choices=("walker2d",))
     frame_skip: int = setting(4, at_least=1)
     reset_noise_scale: float = setting(5e-3, at_least=0)
+    exclude_current_positions_from_observation: bool = True
     forward_reward_weight: float = 1.0
     ctrl_cost_weight: float = 1e-3
     healthy_reward: float = 1.0
@@ -39,6 +43,7 @@ class Walker2d(Task):
     GYMNASIUM_NAME = "Walker2d"
     XML_FILES = {"v5": "walker2d_v5.xml", "v4": "walker2d.xml"}
     HAS_Y = False
+    HEIGHT_INDEX = 1
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_forward", "reward_ctrl", "reward_survive"))
 
     options: Walker2dOptions
@@ -46,6 +51,9 @@ class Walker2d(Task):
     @property
     def terminates_on_fall(self) -> bool:
         return self.options.terminate_when_unhealthy
+
+    def initial_state(self, key: PRNGKeyArray) -> InitialState:
+        return with_uniform_noise(key, self.init_qpos, self.init_qvel, self.options.reset_noise_scale)
 
     def derived_names(self) -> tuple[str, ...]:
         return ()

@@ -26,7 +26,7 @@ usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [policy=best|final] [seed=0]
                   as NAME.mp4 in the current folder.
   html=FILE.html  a page that plays the episode in 3D with its reward terms, in any browser, offline (pip install
                   meshcat)
-  gait=FILE.png   a gait sheet: frames, torso height and speed, floor contacts, torques, reward terms
+  gait=FILE.png   a gait sheet: frames, height and speed of a body, floor contacts, motors, reward terms
   strip=FILE.png  eight frames side by side, over `seconds` from `start`
   viewer=true     MuJoCo's live viewer, which needs a screen; it plays episodes until it is closed
 """

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import sys
+import textwrap
 import traceback
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from omegaconf import DictConfig, open_dict
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.api import resolve, resolve_seeds, train
+from mjx_walk.envs import TASKS
 from mjx_walk.runs.config import (
     CONFIG_DIR,
     Config,
@@ -33,9 +35,14 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import describe, refuse_ineffective
 from mjx_walk.utils.signals import Stopped, exit_code
 
-USAGE = """
-usage: python -m mjx_walk.train [env=humanoid|humanoid_standup|walker2d] [algo=ppo] [KEY=VALUE ...]
+_NAMES = textwrap.fill(
+    f"env={'|'.join(TASKS)}".replace("|", " | "), 100, initial_indent="  ", subsequent_indent="      "
+)
+USAGE = f"""
+usage: python -m mjx_walk.train [env=humanoid] [algo=ppo] [KEY=VALUE ...]
 
+{_NAMES}
+  algo={" | ".join(ALGORITHMS)}
   physics=auto|warp|jax|c   num_envs=N   total_steps=N   seed=N   run_dir=PATH   resume=true
   seeds=N or [3,7]                        train several seeds in one program, each with its own folder
   devices=all or N                        train one run on N GPUs, with one process and num_envs environments each

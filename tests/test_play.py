@@ -44,11 +44,11 @@ def test_an_episode_holds_what_gymnasium_says(run):
     np.testing.assert_allclose(episode.rewards, total, atol=1e-9)
     assert episode.rewards.sum() == pytest.approx(run.evaluate(1, seed=3).mean, rel=1e-6)
     # It runs: the torso gets far, the feet and no other body touch the floor, and the motors stay within their gears.
-    assert episode.torso[-1, 0] > 30 and episode.seconds[-1] == pytest.approx(8.0)
+    assert episode.body[-1, 0] > 30 and episode.seconds[-1] == pytest.approx(8.0)
     touching = episode.floor_contacts.mean(axis=0)
     names = [episode.model.body(i).name for i in np.flatnonzero(touching > 0.01)]
     assert sorted(names) == ["foot", "foot_left"] and 0.1 < touching.max() < 0.9
-    assert 50 < np.abs(episode.torques).max() <= 100.0
+    assert 50 < np.abs(episode.motor_forces).max() <= 100.0
 
 
 @renders

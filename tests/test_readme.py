@@ -5,12 +5,13 @@ import shlex
 from pathlib import Path
 
 import jax.numpy as jnp
+import mujoco
 import pytest
 from helpers import CLONE, README, TINY, blocks, command
 
 import mjx_walk
 from mjx_walk import zoo
-from mjx_walk.envs import make_env
+from mjx_walk.envs import TASKS, make_env
 from mjx_walk.runs.config import load_config
 
 RESULTS = (CLONE / "docs" / "results.md").read_text()
@@ -32,6 +33,18 @@ def test_python_example(tmp_path, monkeypatch, capsys):
     exec(compile(example, "README.md", "exec"), {})
     assert "(16, 348)" in capsys.readouterr().out
     assert len(list(tmp_path.glob("runs/walker2d_ppo/*/eval_gymnasium.json"))) == 1
+
+
+def test_the_table_of_tasks_lists_every_task():
+    row = r"^\| (\w+) \| `(\w+)` \| ([v45, ]+) \| (\d+) \| (\d+) \| ([\d,]+) \| (RK4|Euler) \|$"
+    rows = re.findall(row, README, flags=re.MULTILINE)
+    assert [name for _, name, *_ in rows] == list(TASKS)
+    for title, name, versions, observations, actions, steps, integrator in rows:
+        task = make_env(name, physics="c")
+        assert (title, versions.split(", ")) == (task.GYMNASIUM_NAME, list(task.XML_FILES))
+        sizes = (task.observation_size, task.action_size, task.max_episode_steps)
+        assert sizes == (int(observations), int(actions), int(steps.replace(",", "")))
+        assert f"mjINT_{integrator.upper()}" == mujoco.mjtIntegrator(task.model.opt.integrator).name
 
 
 def test_own_reward(tmp_path, monkeypatch):

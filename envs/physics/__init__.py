@@ -54,7 +54,16 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
         model: the MuJoCo model as loaded.
         num_substeps: physics steps per environment step (Gymnasium's `frame_skip`).
         derived: names of the `mjData` arrays that the task reads.
+
+    Raises:
+        UserError: the model's integrator is implicit.
     """
+    integrator = mujoco.mjtIntegrator(model.opt.integrator)
+    if integrator not in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4):
+        given = integrator.name.removeprefix("mjINT_").lower()
+        raise UserError(
+            f"the model's integrator '{given}' is not supported; set integrator to Euler or RK4 in <option>"
+        )
     if name == "c":
         from mjx_walk.envs.physics.mujoco_c import CEngine
 

@@ -47,8 +47,9 @@ class Engine(Protocol):
             ctrl: in the actuators' units, not clipped.
 
         Returns:
-            The next state; its derived arrays, with RK4 those of the last substep's fourth stage; and whether a contact
-            or constraint buffer overflowed.
+            The next state; the derived arrays of the last forward pass, which precede the last integration: with Euler
+            those at the start of the last substep, with RK4 those of its fourth stage; and whether a contact or
+            constraint buffer overflowed.
         """
         ...
 

@@ -27,12 +27,11 @@ class JaxEngine:
     calls_host = False
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
-        if model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
-            raise ValueError("the jax engine supports the RK4 integrator only; set integrator='RK4' in the model")
         capsule_frames_jax.install()
         model = with_newton_solver(model)
         self._model = mjx.put_model(model, impl="jax")
         self._blank = mjx.make_data(model, impl="jax")
+        self._substep = _runge_kutta_4 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else _euler
         self._num_substeps = num_substeps
         self._derived = derived
 
@@ -48,11 +47,16 @@ class JaxEngine:
         """See `Engine.step`. No buffer overflows: MJX allocates every possible contact."""
         with jax.default_matmul_precision("highest"):
             data = self._data(state).replace(ctrl=ctrl)
-            data, _ = jax.lax.scan(lambda d, _: (_runge_kutta_4(self._model, d), None), data, length=self._num_substeps)
+            data, _ = jax.lax.scan(lambda d, _: (self._substep(self._model, d), None), data, length=self._num_substeps)
             if "cfrc_ext" in self._derived:
                 data = mjx_smooth.rne_postconstraint(self._model, data)
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
         return state, read_derived(data, self._derived), jnp.zeros((), bool)
+
+
+def _euler(model: mjx.Model, start: mjx.Data) -> mjx.Data:
+    """Advance by one substep with semi-implicit Euler and implicit joint damping. Source: MuJoCo's `mj_Euler`."""
+    return mjx_forward.euler(model, mjx_forward.forward(model, start))
 
 
 def _runge_kutta_4(model: mjx.Model, start: mjx.Data) -> mjx.Data:

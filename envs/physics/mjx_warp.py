@@ -26,7 +26,9 @@ SPARE_CONTACTS = 256
 CONSTRAINTS_PER_ENV = 112
 """Capacity of each environment for constraint rows. A contact takes four with friction, else one; a joint limit one.
 
-The highest counts were 49 under random actions and 31 under trained policies."""
+The highest counts were 49 under random actions and 31 under trained policies. Only the humanoids can exceed these
+buffers at all. With every pair of geoms in contact, Ant, the largest of the others, has 13 pairs, 25 contacts and 108
+rows; under random actions it had 2.0 pairs and 0.6 contacts on average, and 26 rows."""
 
 
 class WarpEngine:

@@ -26,9 +26,12 @@ def serve() -> None:
     warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
     import gymnasium
 
+    from mjx_walk.utils.quiet_mujoco import hide_deprecations
+
     gymnasium.logger.min_level = gymnasium.logger.ERROR
     name, keywords, seeds = pickle.load(sys.stdin.buffer)
-    envs = [gymnasium.make(name, **keywords) for _ in seeds]
+    with hide_deprecations():
+        envs = [gymnasium.make(name, **keywords) for _ in seeds]
     obs = np.stack([env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)])
     is_over = np.zeros(len(envs), bool)
     send(answers, obs)

@@ -8,7 +8,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from mjx_walk.envs import State, Task, make_env
@@ -21,6 +20,9 @@ Errors of `qpos` and `qvel` are absolute; errors of observation blocks and rewar
 
 AIRBORNE_HEIGHT = 1.0
 """A third of the environments start this much higher, m."""
+
+THROWN_SPEED = 3.0
+"""Where the root cannot leave the ground, a third start with normal velocities of this deviation, m/s and rad/s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,16 +64,21 @@ class Parity:
 def reference_states(task: Task, num_envs: int, num_steps: int, seed: int) -> tuple[State, jax.Array]:
     """States on C trajectories under random actions, and the action taken in each state.
 
-    A third of the environments starts in the air. None is reset, so all lie on the floor in the end.
+    A third of the environments starts in the air or, where the root cannot leave the ground, thrown. None is reset, so
+    all that can fall lie on the floor in the end.
 
     Returns:
         `[num_steps · num_envs, …]`.
     """
     start_key, action_key = jax.random.split(jax.random.PRNGKey(seed))
     start = jax.vmap(task.reset)(jax.random.split(start_key, num_envs)).physics
-    height = 2 if task.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 1  # of the root in `qpos`
-    lift = jnp.where(jnp.arange(num_envs) % 3 == 0, AIRBORNE_HEIGHT, 0.0)
-    state = jax.vmap(task.reset_to)(start.qpos.at[:, height].add(lift), start.qvel)
+    is_thrown = jnp.arange(num_envs) % 3 == 0
+    if task.HEIGHT_INDEX is None:
+        speeds = THROWN_SPEED * jax.random.normal(jax.random.fold_in(start_key, 1), start.qvel.shape)
+        start = start._replace(qvel=start.qvel + is_thrown[:, None] * speeds)
+    else:
+        start = start._replace(qpos=start.qpos.at[:, task.HEIGHT_INDEX].add(is_thrown * AIRBORNE_HEIGHT))
+    state = jax.vmap(task.reset_to)(start.qpos, start.qvel)
 
     def one(state, key):
         action = jax.random.uniform(key, (num_envs, task.action_size), minval=task.action_low, maxval=task.action_high)

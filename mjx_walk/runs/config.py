@@ -301,10 +301,18 @@ def _one_line(error: BaseException, overrides: list[str]) -> str:
             choices = near or [key for key in valid if key.rpartition(".")[0] == section] or valid
             return f"unknown key '{unknown[0]}'; did you mean: {', '.join(choices)}?"
     if "Could not find 'recipe/" in texts[0]:
-        return f"{_first_line(error)}; recipes: {', '.join(recipe_names())}"
+        return f"{_first_line(error)}; {_fitting_recipes(overrides)}"
     key = getattr(error, "full_key", None) or getattr(error.__cause__, "full_key", None)
     detail = _first_line(error.__cause__ or error)
     return f"{key}: {detail}" if key else detail
+
+
+def _fitting_recipes(overrides: list[str]) -> str:
+    """The recipes for the given, or the default, environment and algorithm."""
+    given = dict(override.split("=", 1) for override in overrides if override.startswith(("env=", "algo=")))
+    task = {"env": "humanoid", "algo": "ppo"} | given
+    names = [name for name in recipe_names() if name.endswith(f"/{task['env']}_{task['algo']}")]
+    return f"recipes for env={task['env']} algo={task['algo']}: {', '.join(names)}"
 
 
 def recipe_names() -> list[str]:

@@ -10,17 +10,10 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from mjx_walk.envs import Task
+from mjx_walk.envs import Task, View
+from mjx_walk.utils.quiet_mujoco import hide_deprecations
 from mjx_walk.viewing.rendering import choose_opengl
 
-_CAMERA = {
-    "type": mujoco.mjtCamera.mjCAMERA_TRACKING,
-    "trackbodyid": 1,
-    "distance": 4.0,
-    "azimuth": 90.0,
-    "elevation": -8.0,
-}
-"""Follows the torso from the side. Gymnasium 1.4's own default stands still and films an empty floor."""
 _FLOOR_SCALE = 20.0
 """MuJoCo draws a plane only as large as its `size`; a fast runner leaves it after 3 seconds."""
 
@@ -35,10 +28,12 @@ class Episode:
     seconds_per_step: float
     qpos: np.ndarray
     """`[T, nq]`."""
-    torso: np.ndarray
-    """`[T, 3]`, position of the first body."""
-    torques: np.ndarray
-    """`[T, nu]`, torque of each motor."""
+    view: View
+    """What the task shows."""
+    body: np.ndarray
+    """`[T, 3]`, position of the body that the view names."""
+    motor_forces: np.ndarray
+    """`[T, nu]`, torque or, on a slider, force of each motor."""
     floor_contacts: np.ndarray
     """`[T, nbody] bool`: the body touches the floor."""
     rewards: np.ndarray
@@ -48,6 +43,11 @@ class Episode:
     frames: list[np.ndarray]
     """`[height, width, 3] u8` each, one every `steps_per_frame` steps; empty if nothing was rendered."""
     steps_per_frame: int
+
+    @property
+    def body_name(self) -> str:
+        """Name of the body that the view names."""
+        return self.model.body(self.view.body).name
 
     @property
     def seconds(self) -> np.ndarray:
@@ -92,12 +92,12 @@ def record_episode(
         obs, reward, terminated, truncated, info = env.step(policy(obs))
         is_over = terminated or truncated
         kept["qpos"].append(data.qpos.copy())
-        kept["torso"].append(data.xpos[1].copy())
-        kept["torques"].append(data.actuator_force * model.actuator_gear[:, 0])
+        kept["body"].append(data.xpos[task.VIEW.body].copy())
+        kept["motor_forces"].append(data.actuator_force * model.actuator_gear[:, 0])
         kept["floor_contacts"].append(_floor_contacts(model, data))
         kept["rewards"].append(float(reward))
-        for name in info:
-            if name.startswith("reward_"):
+        for name in task.gymnasium_reward_terms:
+            if name in info:  # v4 leaves out some
                 terms[name].append(float(info[name]))
         if size and len(kept["rewards"]) % steps_per_frame == 1 % steps_per_frame:
             frames.append(np.asarray(env.render()))
@@ -106,6 +106,7 @@ def record_episode(
         env=task.gymnasium_id,
         model=model,
         seconds_per_step=inner.dt,
+        view=task.VIEW,
         reward_terms={name: np.array(values) for name, values in terms.items()},
         frames=frames,
         steps_per_frame=steps_per_frame,
@@ -116,22 +117,34 @@ def record_episode(
 def make_gymnasium(task: Task, **keywords: Any) -> gymnasium.Env:
     """Make the real Gymnasium environment of a task, with further keywords of `gymnasium.make`."""
     options = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
-    with warnings.catch_warnings():
+    with hide_deprecations(), warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
         return gymnasium.make(task.gymnasium_id, **options, **keywords)
 
 
+def camera_settings(view: View) -> dict[str, Any]:
+    """Fields of MuJoCo's camera for a view. Gymnasium 1.4's own default stands still and films an empty floor."""
+    settings: dict[str, Any] = {
+        "distance": view.distance,
+        "azimuth": view.azimuth,
+        "elevation": view.elevation,
+    }
+    if view.center is None:
+        return settings | {"type": mujoco.mjtCamera.mjCAMERA_TRACKING, "trackbodyid": view.body}
+    return settings | {"type": mujoco.mjtCamera.mjCAMERA_FREE, "lookat": np.array(view.center)}
+
+
 def _make_rendered(task: Task, width: int, height: int) -> gymnasium.Env:
-    """Make the environment so that `render()` gives frames from the side, with the torso in the middle."""
+    """Make the environment so that `render()` gives frames of the task's view."""
     choose_opengl()
     env = make_gymnasium(task, render_mode="rgb_array", width=width, height=height)
     inner: Any = env.unwrapped
     model = inner.model
-    inner.mujoco_renderer.default_cam_config = _CAMERA
+    inner.mujoco_renderer.default_cam_config = camera_settings(task.VIEW)
     inner.mujoco_renderer.camera_id = None  # a camera id would stop the camera from following
     is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     model.geom_size[is_plane, :2] *= _FLOOR_SCALE
-    model.mat_texrepeat[model.geom_matid[is_plane]] *= _FLOOR_SCALE
+    model.mat_texrepeat[model.geom_matid[is_plane & (model.geom_matid >= 0)]] *= _FLOOR_SCALE
     model.vis.quality.shadowsize = 1024  # MuJoCo's 4096 takes a quarter of the rendering time on a CPU
     return env
 

@@ -14,12 +14,14 @@ _NUM_FRAMES = 8
 _STRIP_SECONDS = 1.0
 _DETAIL_SECONDS = 3.0
 """Time shown of contacts, torques and reward terms, which repeat many times in an episode."""
+_NO_HEIGHT = 1e-6
+"""Range of heights below which a body moves in a horizontal plane, m. Then its y is drawn instead."""
 
 
 def draw_gait_sheet(episode: Episode, path: Path) -> Path:
-    """Draw a gait sheet: torso height and speed over the complete episode, and details from its middle.
+    """Draw a gait sheet: height and speed of the view's body over the complete episode, and details from its middle.
 
-    The details are frames over a second, and floor contacts, torques and reward terms over three seconds.
+    The details are frames over a second, and floor contacts, motors and reward terms over three seconds.
     """
     figure = matplotlib.figure.Figure(figsize=(12, 13), layout="constrained")
     grid = figure.add_gridspec(5, 2, height_ratios=[1.3, 1, 1, 1.2, 1.2])
@@ -30,15 +32,16 @@ def draw_gait_sheet(episode: Episode, path: Path) -> Path:
     figure.suptitle(f"{episode.env}: return {episode.rewards.sum():,.0f} in {length}")
     _frames(figure.add_subplot(grid[0, :]), episode, float(episode.seconds[start]))
     height = figure.add_subplot(grid[1, :])
-    height.plot(episode.seconds, episode.torso[:, 2])
-    height.set_ylabel("torso height (m)")
+    moves_in_plane = np.ptp(episode.body[:, 2]) < _NO_HEIGHT
+    height.plot(episode.seconds, episode.body[:, 1 if moves_in_plane else 2])
+    height.set_ylabel(f"{episode.body_name} {'y' if moves_in_plane else 'height'} (m)")
     speed = figure.add_subplot(grid[2, :], sharex=height)
-    speed.plot(episode.seconds[1:], np.diff(episode.torso[:, 0]) / episode.seconds_per_step)
-    speed.set_ylabel("torso speed forward (m/s)")
+    speed.plot(episode.seconds[1:], np.diff(episode.body[:, 0]) / episode.seconds_per_step)
+    speed.set_ylabel(f"{episode.body_name} speed along x (m/s)")
     speed.set_xlabel("seconds")
     _contacts(figure.add_subplot(grid[3, :]), episode, shown)
-    torques = dict(zip(_motor_names(episode.model), episode.torques.T, strict=True))
-    _lines(figure.add_subplot(grid[4, 0]), episode, shown, torques, "torque (N·m)")
+    forces = dict(zip(_motor_names(episode.model), episode.motor_forces.T, strict=True))
+    _lines(figure.add_subplot(grid[4, 0]), episode, shown, forces, "motor torque (N·m) or force (N)")
     _lines(figure.add_subplot(grid[4, 1]), episode, shown, episode.reward_terms, "reward term per step")
     for axes in figure.axes[1:]:
         axes.grid(alpha=0.3)
@@ -82,7 +85,7 @@ def _contacts(axes: Axes, episode: Episode, shown: slice) -> None:
         axes.broken_barh([(t, episode.seconds_per_step) for t in edges[touching]], (line - 0.4, 0.8))
     axes.set_yticks(range(len(bodies)), [episode.model.body(body).name for body in bodies])
     axes.set_xlim(edges[0], edges[-1])
-    axes.set_title("floor contacts", fontsize=9)
+    axes.set_title("floor contacts" if bodies else "no floor contacts", fontsize=9)
 
 
 def _lines(axes: Axes, episode: Episode, shown: slice, series: dict[str, np.ndarray], ylabel: str) -> None:

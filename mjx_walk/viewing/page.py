@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjx_walk.envs import View
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import write_text
 from mjx_walk.viewing.episode import Episode
@@ -48,7 +49,9 @@ def write_page(episode: Episode, path: Path) -> Path:
         "num_steps": len(episode.rewards),
         "num_bodies": model.nbody,
         "seconds_per_step": episode.seconds_per_step,
-        "eye_height": round(float(episode.torso[:, 2].max()) * 0.6, 3),
+        "body": episode.view.body,
+        "body_name": episode.body_name,
+        **_camera(episode),
         "geoms": _geoms(model),
         "floors": _rounded(model.geom_pos[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, 2]),
         "poses": base64.b64encode(_body_poses(episode).astype("<f4").tobytes()).decode(),
@@ -62,6 +65,21 @@ def write_page(episode: Episode, path: Path) -> Path:
     )
     write_text(path, page)
     return path
+
+
+def _camera(episode: Episode) -> dict[str, Any]:
+    """The point that stays in the middle of the page, and the camera's place relative to it.
+
+    The point moves with the body if the view follows it; then it is at 0.6 of the body's greatest height. Places are in
+    three.js's coordinates: x to the right, y up, z towards the viewer.
+    """
+    view = episode.view
+    azimuth, elevation = np.deg2rad((view.azimuth, view.elevation))
+    sight = np.array((np.cos(elevation) * np.cos(azimuth), np.sin(elevation), -np.cos(elevation) * np.sin(azimuth)))
+    eye = np.array((0.5, 0.7, 3.2)) if view == View() else -view.distance * sight
+    center = view.center
+    height = float(episode.body[:, 2].max()) * 0.6 if center is None else center[2]
+    return {"eye": _rounded(eye), "center": center and [*center[:2]], "eye_height": round(height, 3)}
 
 
 def _inside_script(text: str) -> str:

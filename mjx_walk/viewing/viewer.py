@@ -9,7 +9,7 @@ import numpy as np
 
 from mjx_walk.envs import Task
 from mjx_walk.utils.errors import UserError
-from mjx_walk.viewing.episode import make_gymnasium
+from mjx_walk.viewing.episode import camera_settings, make_gymnasium
 
 
 def show(task: Task, policy: Callable[[np.ndarray], np.ndarray], seed: int = 0) -> None:
@@ -36,8 +36,8 @@ def show(task: Task, policy: Callable[[np.ndarray], np.ndarray], seed: int = 0) 
         hint = "on macOS run it with mjpython instead of python" if sys.platform == "darwin" else str(error)
         raise UserError(f"the viewer could not be opened: {hint}") from error
     with window:
-        window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-        window.cam.trackbodyid, window.cam.distance = 1, 4.0
+        for name, value in camera_settings(task.VIEW).items():
+            setattr(window.cam, name, value)
         is_over = True
         while window.is_running():
             if is_over:

@@ -15,18 +15,50 @@ from mjx_walk.utils.errors import UserError
 
 prepare_jax()  # before any test of this process starts JAX
 
-CASES = [(name, "v5", "warp") for name in TASKS]
-CASES += [("humanoid", "v4", "warp"), ("walker2d", "v5", "jax")]
+FAST = [("humanoid", "v5", "warp"), ("half_cheetah", "v5", "jax")]
+"""Both engines, both integrators."""
+EVERY = [
+    (name, version, physics) for name in TASKS for version in TASKS[name][0].XML_FILES for physics in ("jax", "warp")
+]
+CASES = [*FAST, *(pytest.param(*case, marks=pytest.mark.slow) for case in EVERY if case not in FAST)]
 
 
 @pytest.mark.parametrize(("name", "version", "physics"), CASES)
-def test_one_step_from_standing_airborne_and_fallen_states(name, version, physics):
+def test_one_step_from_standing_airborne_thrown_and_fallen_states(name, version, physics):
     found = parity.check(name, version, physics, num_envs=24, num_steps=70)
     assert found.is_within, "\n".join(map(str, found.errors))
     assert found.num_steps >= 1600
-    if name != "humanoid_standup":  # both sides of the healthy range were visited
+    if make_env(name, physics="c").terminates_on_fall:  # both sides of the healthy range were visited
         assert 100 < found.num_terminations < found.num_steps - 100
 
+
+@pytest.mark.parametrize("physics", ["jax", "warp", "c"])
+@pytest.mark.parametrize("integrator", ["implicit", "implicitfast"])
+def test_implicit_integrators_are_refused(physics, integrator):
+    model = mujoco.MjModel.from_xml_string(TILTED_CAPSULE.replace("RK4", integrator))
+    with pytest.raises(UserError, match=f"integrator '{integrator}' is not supported; set integrator to Euler or RK4"):
+        make_engine(physics, model, 1, ())
+
+
+@pytest.mark.parametrize("physics", ["jax", "warp"])
+def test_euler_damps_joints_implicitly(physics):
+    """With explicit damping, a light joint with strong damping would blow up at this time step."""
+    model = mujoco.MjModel.from_xml_string(DAMPED_HINGE)
+    state = PhysicsState(jnp.float32([0.3]), jnp.float32([5.0]), jnp.zeros(1))
+    found, expected = (make_engine(name, model, 5, ()).step(state, jnp.zeros(0))[0] for name in (physics, "c"))
+    assert 0 < abs(float(expected.qvel[0])) < 1.0
+    np.testing.assert_allclose(found.qvel, expected.qvel, rtol=1e-4)
+    np.testing.assert_allclose(found.qpos, expected.qpos, rtol=1e-5)
+
+
+DAMPED_HINGE = """
+<mujoco>
+  <option integrator="Euler" timestep="0.01"/>
+  <worldbody>
+    <body><joint damping="1"/><geom type="capsule" size="0.05 0.2" pos="0 0 -0.2" mass="0.1"/></body>
+  </worldbody>
+</mujoco>
+"""
 
 TILTED_CAPSULE = """
 <mujoco>

@@ -76,6 +76,15 @@ def test_shaping_terms_equal_their_definitions():
     assert fell == 1
 
 
+def test_shaking_counts_the_joints_with_a_motor():
+    """Reacher's target and Pusher's object have none, and InvertedPendulum's motor is on its first joint."""
+    for name, motors in (("reacher", [0, 1]), ("pusher", range(7)), ("inverted_pendulum", [0]), ("ant", range(6, 14))):
+        task = make_env(name, physics="c", shaping=Shaping(shaking=0.5))
+        _, after = step(task, {0: 0.1}, 0.7)
+        expected = -0.5 * np.mean(np.asarray(after.physics.qvel)[list(motors)] ** 2)
+        assert float(after.metrics["reward_shaking"]) == pytest.approx(expected, rel=1e-5), name
+
+
 def test_zero_weights_add_no_terms():
     assert make_env("walker2d", physics="c").reward_terms == ("reward_forward", "reward_ctrl", "reward_survive")
 
@@ -160,6 +169,9 @@ def test_invalid_reward_function_is_refused(custom, tmp_path, monkeypatch, funct
     ("name", "shaping", "says"),
     [
         ("walker2d", {"keep_y": 1.0}, "walker2d has no y coordinate; set it to 0"),
+        ("hopper", {"keep_y": 1.0}, "hopper has no y coordinate; set it to 0"),
+        ("reacher", {"backward": 1.0}, "reacher has no x coordinate; set it to 0"),
+        ("pusher", {"falling": 1.0}, "no fall terminates this pusher; set it to 0"),
         ("humanoid_standup", {"falling": 1.0}, "no fall terminates this humanoid_standup; set it to 0"),
         ("walker2d", {"faling": 1.0}, "unknown key 'env.shaping.faling'"),
     ],

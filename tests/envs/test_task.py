@@ -6,6 +6,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import jaxtyping
+import mujoco
 import numpy as np
 import pytest
 from shapes import check_shapes
@@ -14,6 +15,8 @@ from toy_tasks import MountainCar
 from mjx_walk.envs import TASKS, TrainableTask, make_env
 from mjx_walk.envs.physics import base
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.quiet_mujoco import hide_deprecations
+from mjx_walk.viewing.episode import make_gymnasium
 
 
 def test_vmap_equals_separate_steps():
@@ -88,7 +91,16 @@ def test_state_holds_no_derived_arrays():
 
 @pytest.mark.parametrize("name", TASKS)
 def test_shapes_equal_the_annotations(name, monkeypatch):
-    methods = ("reset", "reset_to", "step", "carry", "observe", "reward_and_termination", "scale_action")
+    methods = (
+        "reset",
+        "initial_state",
+        "reset_to",
+        "step",
+        "carry",
+        "observe",
+        "reward_and_termination",
+        "scale_action",
+    )
     check_shapes(monkeypatch, TASKS[name][0], *methods)
     task = make_env(name, physics="c")
     states = jax.vmap(task.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
@@ -118,6 +130,15 @@ def test_actions_are_scaled_to_gymnasiums_units(name):
         ({"healthy_rewad": 1.0}, "did you mean 'healthy_reward'?"),
         ({"xml_file": "no_such.xml"}, "model file not found"),
         ({"frame_skip": 0}, "must be at least 1"),
+        (
+            {"name": "pusher", "version": "v4"},
+            "Gymnasium supports Pusher-v4 only with MuJoCo below 3; choose one of: v5",
+        ),
+        ({"name": "ant", "use_contact_forces": True}, "ant v5 does not take use_contact_forces; use version=v4"),
+        ({"name": "ant", "main_body": "head"}, "no body 'head', which the task reads; its bodies: world, torso"),
+        ({"name": "ant", "main_body": 99}, "the model has no body '99'"),
+        ({"name": "reacher", "xml_file": "hopper.xml"}, "the model has no body 'fingertip'"),
+        ({"name": "reacher", "reset_noise_scale": 0.1}, "reacher has no option 'reset_noise_scale'"),
         ({"name": "humanoid", "version": "v4", "include_cvel_in_observation": False}, "does not take include_cvel"),
     ],
 )
@@ -134,3 +155,14 @@ def test_custom_model_file(tmp_path):
     task = make_env("walker2d", physics="c", xml_file=str(path))
     assert task.dt == pytest.approx(0.004)
     assert task.gymnasium_kwargs() == {"xml_file": str(path)}
+
+
+def test_loading_models_prints_no_deprecations(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    task = make_env("half_cheetah", physics="c")
+    make_gymnasium(task).close()
+    printed = capfd.readouterr()
+    assert printed.out == printed.err == "" and not list(tmp_path.iterdir())
+    with pytest.warns(UserWarning, match="a warning of another kind"), hide_deprecations():
+        mujoco.get_mju_user_warning()("a warning of another kind")
+    assert mujoco.get_mju_user_warning() is None

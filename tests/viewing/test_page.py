@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import mjx_walk
+from mjx_walk.envs import View
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing import page
 from mjx_walk.viewing.episode import Episode, record_episode
@@ -55,7 +56,7 @@ def test_the_page_holds_the_episode_and_needs_nothing_else(tmp_path, episode):
         np.testing.assert_allclose(data["series"][name], values, atol=1e-4)
     poses = np.frombuffer(base64.b64decode(data["poses"]), "<f4").reshape(1000, episode.model.nbody, 7)
     # `xpos` after a step is that of RK4's last stage, not quite that of `qpos`.
-    np.testing.assert_allclose(poses[:, 1, :3], episode.torso, atol=1e-3)
+    np.testing.assert_allclose(poses[:, 1, :3], episode.body, atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(poses[..., 3:], axis=-1), 1.0, atol=1e-6)
     # The torso's rotation is MuJoCo's, with the real part last.
     pitch = episode.qpos[:, 2]
@@ -66,7 +67,7 @@ def test_the_page_holds_the_episode_and_needs_nothing_else(tmp_path, episode):
 def test_every_shape_that_is_seen_is_drawn(tmp_path):
     model = mujoco.MjModel.from_xml_string(EVERY_SHAPE)
     standing = np.tile(model.qpos0, (2, 1))
-    facts = {"seconds_per_step": 0.1, "torso": standing[:, :3], "torques": np.zeros((2, 0))}
+    facts = {"seconds_per_step": 0.1, "body": standing[:, :3], "motor_forces": np.zeros((2, 0)), "view": View()}
     nothing = {"floor_contacts": np.zeros((2, 2), bool), "frames": [], "steps_per_frame": 1}
     terms = {"reward_a</script>": np.ones(2)}
     made = Episode("Own", model, qpos=standing, rewards=np.ones(2), reward_terms=terms, **facts, **nothing)

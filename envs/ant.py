@@ -1,0 +1,131 @@
+"""Ant: run forward on four legs."""
+
+import dataclasses
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, PRNGKeyArray
+
+from mjx_walk.envs.physics import Derived, PhysicsState
+from mjx_walk.envs.resets import InitialState, with_normal_velocity
+from mjx_walk.envs.reward_shaping import Terms
+from mjx_walk.envs.state import Carry, State
+from mjx_walk.envs.task import Task
+from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.utils.settings import setting
+
+
+@dataclasses.dataclass
+class AntOptions(TaskOptions):
+    """Keyword arguments of Gymnasium's `AntEnv`."""
+
+    name: str = setting("ant", choices=("ant",))
+    forward_reward_weight: float = 1.0
+    ctrl_cost_weight: float = 0.5
+    use_contact_forces: bool = setting(False, only_if={"version": "v4"})
+    """Whether v4 observes contact forces and charges their cost."""
+    contact_cost_weight: float = 5e-4
+    healthy_reward: float = 1.0
+    main_body: int | str = 1
+    """Body whose forward speed is rewarded, by its index or name."""
+    terminate_when_unhealthy: bool = True
+    healthy_z_range: tuple[float, float] = (0.2, 1.0)
+    contact_force_range: tuple[float, float] = (-1.0, 1.0)
+    reset_noise_scale: float = setting(0.1, at_least=0)
+    exclude_current_positions_from_observation: bool = True
+    include_cfrc_ext_in_observation: bool = True
+
+
+class Ant(Task):
+    """Ant, which runs forward and must stay upright.
+
+    Source: `gymnasium/envs/mujoco/ant_v5.py` and `ant_v4.py`.
+    """
+
+    GYMNASIUM_NAME = "Ant"
+    XML_FILES = {"v5": "ant.xml", "v4": "ant.xml"}
+    REWARD_TERMS = {
+        "v5": ("reward_forward", "reward_ctrl", "reward_contact", "reward_survive"),
+        "v4": ("reward_forward", "reward_ctrl", "reward_survive"),
+    }
+    V5_ONLY = ("frame_skip", "forward_reward_weight", "main_body", "include_cfrc_ext_in_observation")
+    V4_ONLY = ("use_contact_forces",)
+    HEIGHT_INDEX = 2
+
+    options: AntOptions
+
+    @property
+    def terminates_on_fall(self) -> bool:
+        return self.options.terminate_when_unhealthy
+
+    @property
+    def gymnasium_reward_terms(self) -> tuple[str, ...]:
+        unnamed = ("reward_quadctrl",) if self.options.use_contact_forces else ()
+        return (*super().gymnasium_reward_terms, *unnamed)
+
+    @property
+    def _has_contact_cost(self) -> bool:
+        return self.options.version == "v5" or self.options.use_contact_forces
+
+    @property
+    def _observes_forces(self) -> bool:
+        return self._has_contact_cost and self.options.include_cfrc_ext_in_observation
+
+    def initial_state(self, key: PRNGKeyArray) -> InitialState:
+        return with_normal_velocity(key, self.init_qpos, self.init_qvel, self.options.reset_noise_scale)
+
+    def named_bodies(self) -> tuple[int | str, ...]:
+        return (self.options.main_body if self.options.version == "v5" else "torso",)
+
+    def derived_names(self) -> tuple[str, ...]:
+        return ("xpos", "cfrc_ext") if self._has_contact_cost else ("xpos",)
+
+    def observation_blocks(self) -> dict[str, int]:
+        skipped = 2 * self.options.exclude_current_positions_from_observation
+        blocks = {"qpos": self.model.nq - skipped, "qvel": self.model.nv}
+        return blocks | ({"cfrc_ext": 6 * (self.model.nbody - self._first_body)} if self._observes_forces else {})
+
+    @property
+    def _first_body(self) -> int:
+        """First body whose force is observed. v4 includes the zeros of the world body."""
+        return 1 if self.options.version == "v5" else 0
+
+    def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
+        """Observation, `[105]` in v5 and `[27]` in v4.
+
+        It holds positions without x and y (13), velocities (14) and, in v5, clipped contact forces (78).
+        """
+        qpos = physics.qpos[2:] if self.options.exclude_current_positions_from_observation else physics.qpos
+        forces = [self._contact_forces(derived)[self._first_body :].ravel()] if self._observes_forces else []
+        return jnp.concatenate([qpos, physics.qvel, *forces])
+
+    def _contact_forces(self, derived: Derived) -> Float[Array, "nbody 6"]:
+        return jnp.clip(derived["cfrc_ext"], *self.options.contact_force_range)
+
+    def carry(self, physics: PhysicsState, derived: Derived) -> Carry:
+        """Position of the main body `[2]`, x and y in m. The next step's velocity is its displacement."""
+        (body,) = self.body_ids.values()
+        return {"main_body": derived["xpos"][body, :2]}
+
+    def reward_and_termination(
+        self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
+    ) -> tuple[Terms, Float[Array, ""], Bool[Array, ""]]:
+        options = self.options
+        low, high = options.healthy_z_range
+        is_healthy = (low <= physics.qpos[2]) & (physics.qpos[2] <= high)
+        # v4 also pays the healthy reward in the step that terminates the episode.
+        is_paid = is_healthy | (options.terminate_when_unhealthy and options.version == "v4")
+        velocity = (carry["main_body"][0] - before.memory["main_body"][0]) / self.dt
+        terms = {
+            "reward_forward": options.forward_reward_weight * velocity,
+            "reward_ctrl": -options.ctrl_cost_weight * jnp.square(action).sum(),
+            "reward_survive": options.healthy_reward * is_paid,
+        }
+        if self._has_contact_cost:
+            contact = -options.contact_cost_weight * jnp.square(self._contact_forces(derived)).sum()
+            if options.version == "v5":
+                terms["reward_contact"] = contact
+            else:
+                # As in Gymnasium, v4's `reward_ctrl` is then the contact cost; the control cost gets a name of ours.
+                terms |= {"reward_ctrl": contact, "reward_quadctrl": terms["reward_ctrl"]}
+        return terms, sum(terms.values(), jnp.float32(0.0)), ~is_healthy & options.terminate_when_unhealthy

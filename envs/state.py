@@ -1,0 +1,64 @@
+"""The contract between tasks and trainers: the state of an environment, and what a trainer needs of a task."""
+
+from typing import Protocol
+
+import flax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, PRNGKeyArray
+
+from mjx_walk.envs.physics import PhysicsState
+
+NO_TIME_LIMIT = 2**31 - 1
+"""Value of `max_episode_steps` when a caller or a wrapper applies the time limit."""
+
+Carry = dict[str, Array]
+"""Quantities of one step that the next step's reward needs, in addition to the physics state."""
+
+
+class State(flax.struct.PyTreeNode):
+    """State of one environment. It holds no MuJoCo data: the engine rebuilds them in each step."""
+
+    physics: PhysicsState
+    memory: Carry
+    """The task's carry. Checkpoints store it under this name."""
+    obs: Array
+    """`[observation_size] f32`, in Gymnasium's order and units."""
+    reward: Array
+    """`[] f32`."""
+    terminated: Array
+    """`[] bool`: the task ended the episode, so no reward follows."""
+    truncated: Array
+    """`[] bool`: the episode reached the time limit."""
+    steps: Array
+    """`[] i32`: steps since the reset."""
+    metrics: dict[str, Array]
+    """`[] f32` each: the reward terms under the names of Gymnasium's `info`, `nonfinite` and `overflow`."""
+
+
+class TrainableTask(Protocol):
+    """What a trainer needs of a task. All methods are pure functions of one unbatched environment."""
+
+    observation_size: int
+    action_size: int
+    action_low: Array
+    """`[action_size] f32`, in Gymnasium's units."""
+    action_high: Array
+    """`[action_size] f32`, in Gymnasium's units."""
+    reward_terms: tuple[str, ...]
+    """Names of the reward terms in `State.metrics`."""
+    max_episode_steps: int
+    """Time limit, after which `State.truncated` is set."""
+
+    def reset(self, key: PRNGKeyArray) -> State:
+        """Random initial state."""
+        ...
+
+    def step(self, state: State, action: Float[Array, " action_size"]) -> State:
+        """Next state. Its metrics hold the reward terms, `nonfinite` and `overflow`."""
+        ...
+
+    def scale_action(self, action: Float[Array, "*batch action_size"]) -> Float[Array, "*batch action_size"]:
+        """Actions in Gymnasium's units, from actions in [-1, 1]; values outside that range are clipped."""
+        center = (self.action_high + self.action_low) / 2
+        return center + (self.action_high - self.action_low) / 2 * jnp.clip(action, -1.0, 1.0)

@@ -1,0 +1,56 @@
+"""Env options that all tasks share."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from mjx_walk.envs.reward_files import absolute_source
+from mjx_walk.envs.reward_shaping import Shaping
+from mjx_walk.envs.state import NO_TIME_LIMIT
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import setting
+
+
+@dataclasses.dataclass
+class TaskOptions:
+    """Env options of all tasks. Subclasses add the keyword arguments of their Gymnasium class."""
+
+    name: str = ""
+    version: str = setting("v5", choices=("v5", "v4"))
+    xml_file: str | None = None
+    """Model file: a path, or the name of one of Gymnasium's assets. Default: the version's own model."""
+    frame_skip: int = setting(5, at_least=1)
+    max_episode_steps: int = setting(1000, at_least=1, at_most=NO_TIME_LIMIT)
+    shaping: Shaping = dataclasses.field(default_factory=Shaping)
+    """Weights of additional reward terms."""
+    reward_function: str | None = None
+    """`PATH.py:FUNCTION`, a custom reward that replaces Gymnasium's; see `mjx_walk.envs.reward_shaping`."""
+
+    def __post_init__(self):
+        for name, value in list(vars(self).items()):
+            if isinstance(value, list):  # a configuration file gives a range as a list
+                setattr(self, name, tuple(value))
+        if isinstance(self.shaping, dict):
+            unknown = self.shaping.keys() - {field.name for field in dataclasses.fields(Shaping)}
+            if unknown:
+                raise UserError(f"unknown key 'env.shaping.{min(unknown)}'")
+            self.shaping = Shaping(**self.shaping)
+
+    def changed(self) -> dict[str, Any]:
+        """Options that differ from their defaults."""
+        defaults = vars(type(self)())
+        return {name: value for name, value in vars(self).items() if value != defaults[name]}
+
+
+def with_absolute_paths(options: TaskOptions, folder: Path) -> TaskOptions:
+    """Options whose files stay the same ones when a run is loaded from another working directory.
+
+    Args:
+        options: env options as a user gives them.
+        folder: what a relative path is relative to.
+    """
+    xml_file, source = options.xml_file, options.reward_function
+    if xml_file and (folder / Path(xml_file).expanduser()).is_file():
+        xml_file = str((folder / Path(xml_file).expanduser()).resolve())
+    source = absolute_source(source, folder) if source else source
+    return dataclasses.replace(options, xml_file=xml_file, reward_function=source)

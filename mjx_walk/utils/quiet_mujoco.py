@@ -1,0 +1,27 @@
+"""MuJoCo's warnings while it loads a model. This module does not import JAX."""
+
+import contextlib
+import warnings
+from collections.abc import Iterator
+
+import mujoco
+
+
+@contextlib.contextmanager
+def hide_deprecations() -> Iterator[None]:
+    """Hide MuJoCo's deprecation warnings, and turn its other warnings into Python's.
+
+    MuJoCo prints each warning to stderr and appends it to `MUJOCO_LOG.TXT` in the working directory. Every load of
+    Gymnasium's HalfCheetah warns of a deprecated attribute, which users cannot change.
+    """
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_warn)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(previous)
+
+
+def _warn(message: str) -> None:
+    if "is deprecated" not in message:
+        warnings.warn(message, stacklevel=2)
