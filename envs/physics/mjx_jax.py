@@ -55,8 +55,16 @@ class JaxEngine:
 
 
 def _euler(model: mjx.Model, start: mjx.Data) -> mjx.Data:
-    """Advance by one substep with semi-implicit Euler and implicit joint damping. Source: MuJoCo's `mj_Euler`."""
-    return mjx_forward.euler(model, mjx_forward.forward(model, start))
+    """Advance by one substep with semi-implicit Euler and implicit joint damping. Source: MuJoCo's `mj_Euler`.
+
+    Euler factorizes the mass matrix a second time, with the damping. Each factorization of a large batch waits for
+    XLA's threads while it occupies one of them. On a CPU with two threads, two at the same time would wait for each
+    other forever. The added zero makes the second one wait for the accelerations, which need the first.
+    """
+    data = mjx_forward.forward(model, start)
+    if model.nv:
+        data = data.tree_replace({"_impl.M": data._impl.M + 0.0 * data.qacc[0]})
+    return mjx_forward.euler(model, data)
 
 
 def _runge_kutta_4(model: mjx.Model, start: mjx.Data) -> mjx.Data:
