@@ -1,6 +1,10 @@
-"""`python -m mjx_walk.compare env=humanoid 'algos=[ppo,sac]' seeds=3`: compare algorithms and settings over seeds."""
+"""`python -m mjx_walk.compare env=humanoid 'algos=[ppo,sac]' seeds=3`: compare algorithms and settings over seeds.
+
+`suite=mujoco` in place of `env=…` compares them on all environments.
+"""
 
 import dataclasses
+import functools
 import os
 import sys
 from pathlib import Path
@@ -9,7 +13,7 @@ from typing import Any
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.experiments import planned_runs
 from mjx_walk.experiments.planned_runs import PlannedRun
-from mjx_walk.experiments.report import write_report
+from mjx_walk.experiments.suite import SUITES, plan_suite, write_report
 from mjx_walk.runs.config import Config
 from mjx_walk.utils import cli
 from mjx_walk.utils.devices import count_devices
@@ -18,13 +22,14 @@ from mjx_walk.utils.settings import setting
 from mjx_walk.utils.signals import exit_code
 
 USAGE = """
-usage: python -m mjx_walk.compare [env=ENV] ['algos=[ppo,sac,td3]'] [seeds=3] [out=DIR] [KEY=VALUE ...]
+usage: python -m mjx_walk.compare [env=ENV|suite=mujoco] ['algos=[ppo,sac,td3]'] [seeds=3] [out=DIR] [KEY=VALUE ...]
 
+  suite=mujoco         all eleven environments, each with its own recipes; the report normalizes scores
   algos=[…]            algorithms, each with its recipe for the environment; by default all
   seeds=N or [3,7]     the seeds 0 to N-1, or the listed ones
   KEY=VALUE            as for train, for all runs: env=walker2d total_steps=1_000_000
   KEY=A,B,C            a variant per value: algo.learning_rate=1e-3,3e-4
-  out=DIR              by default runs/compare_ENV; finished runs there are kept, and interrupted ones resume
+  out=DIR              by default runs/compare_ENV or _SUITE; finished runs there are kept, and interrupted ones resume
   devices=N            GPUs to use; by default all
   per_device=N         processes that share a GPU
   together=N           seeds of a variant that one process trains; by default one on a CPU, and on GPUs as many as keep
@@ -39,6 +44,7 @@ It updates comparison.png, comparison.md and comparison.csv in out=DIR whenever 
 class Arguments:
     """Arguments that are not settings of the runs."""
 
+    suite: str | None = setting(None, choices=tuple(SUITES))
     algos: tuple[str, ...] = setting(tuple(ALGORITHMS), choices=tuple(ALGORITHMS))
     seeds: Any = 3
     out: str | None = None
@@ -63,7 +69,8 @@ def main(command_line: list[str]) -> int:
     count = arguments.devices or available
     if count > available:
         raise UserError(f"devices={count}: this machine has {available}")
-    out, planned = planned_runs.plan(overrides, list(arguments.algos), seeds, arguments.out, hardware)
+    options = (overrides, list(arguments.algos), seeds, arguments.out, hardware)
+    out, planned = plan_suite(arguments.suite, *options) if arguments.suite else planned_runs.plan(*options)
     unfinished = [run for run in planned if not run.is_finished]
     print(f"{len(planned)} runs in {out}, {len(planned) - len(unfinished)} of them finished already", flush=True)
     slots: list[int | None] = list(range(count)) if hardware == "gpu" else [None]
@@ -72,7 +79,11 @@ def main(command_line: list[str]) -> int:
     default = planned_runs.most_together(unfinished, len(slots)) if hardware == "gpu" else 1
     jobs = planned_runs.jobs(unfinished, arguments.together or default)
     signal_name = planned_runs.run_jobs(
-        jobs, slots, out / "logs", _on_end, lambda run: print(f"  {run.name}: {run.progress}", flush=True)
+        jobs,
+        slots,
+        out / "logs",
+        functools.partial(_on_end, out),
+        lambda run: print(f"  {run.name}: {run.progress}", flush=True),
     )
     if signal_name:
         print(f"Stopped by {signal_name}. Run the same command to resume.")
@@ -84,7 +95,11 @@ def main(command_line: list[str]) -> int:
     return 1 if failed else 0
 
 
-def _on_end(run: PlannedRun, log: Path) -> None:
+def _on_progress(run: PlannedRun) -> None:
+    print(f"  {run.name}: {run.progress}", flush=True)
+
+
+def _on_end(out: Path, run: PlannedRun, log: Path) -> None:
     """Print how a run has ended, and update the report."""
     if not run.is_finished:
         is_out_of_memory = "RESOURCE_EXHAUSTED" in log.read_text(errors="replace")[-10_000:]
@@ -92,7 +107,6 @@ def _on_end(run: PlannedRun, log: Path) -> None:
         print(f"{run.name}: not finished; see {log}{hint}", flush=True)
         return
     print(f"{run.name}: finished", flush=True)
-    out = run.folder.path.parents[1]
     try:
         write_report(out)
     except (UserError, OSError, ValueError) as error:  # the other runs continue

@@ -26,6 +26,7 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import open_to_append
 from mjx_walk.utils.signals import Interrupt
 from mjx_walk.utils.subprocesses import start_module
+from mjx_walk.utils.text import format_score
 
 _SECONDS_BETWEEN_REPORTS = 30.0
 _MEMORY_FRACTION = 0.75
@@ -37,7 +38,7 @@ class PlannedRun:
     """One run of a comparison."""
 
     variant: str
-    """Algorithm and swept values, as a folder name: `ppo`, `ppo_learning_rate-0.001`."""
+    """Algorithm and swept values, as a folder name: `ppo`, `ppo_learning_rate-0.001`; in a suite, `ant/ppo`."""
     overrides: tuple[str, ...]
     """Settings of the variant, without the seed and the folder."""
     config: Config
@@ -73,7 +74,7 @@ class PlannedRun:
             return "starting"
         returns = [row["episode/return"] for row in rows if row.get("episode/return") is not None]
         text = f"{rows[-1]['env_steps'] / 1e6:.2f} of {self.config.total_steps / 1e6:.2f} million steps"
-        return text + (f", return {returns[-1]:,.0f}" if returns else "")
+        return text + (f", return {format_score(returns[-1])}" if returns else "")
 
 
 def plan(

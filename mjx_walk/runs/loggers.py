@@ -20,6 +20,7 @@ from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.tensorboard import SummaryWriter
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import open_to_append, write_text
+from mjx_walk.utils.text import format_score
 
 __all__ = ["MetricsWriter", "Progress", "WandbLog", "require_wandb"]
 
@@ -137,12 +138,11 @@ class Progress:
     def update(self, row: Row) -> None:
         """Show one row."""
         self._evaluated = row.get("eval/return", self._evaluated)
-        facts = {
-            "return": row.get("episode/return"),
-            "length": row.get("episode/length"),
-            "eval": self._evaluated,
-        }
-        shown = {name: f"{value:,.0f}" for name, value in facts.items() if value is not None}
+        shown = {}
+        if row.get("episode/return") is not None:
+            shown = {"return": format_score(row["episode/return"]), "length": f"{row['episode/length']:,.0f}"}
+        if self._evaluated is not None:
+            shown["eval"] = format_score(self._evaluated)
         if self._is_terminal:
             self._bar.set_postfix(shown, refresh=False)
             self._bar.update(int(row["env_steps"]) - self._bar.n)

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from mjx_walk.utils.files import replacing
+from mjx_walk.utils.text import format_score
 from mjx_walk.viewing.episode import Episode
 
 _NUM_FRAMES = 8
@@ -29,7 +30,7 @@ def draw_gait_sheet(episode: Episode, path: Path) -> Path:
     start = max(0, (len(episode.rewards) - 1 - num_detail_steps) // 2)
     shown = slice(start, start + num_detail_steps)
     length = f"{len(episode.rewards)} steps ({episode.seconds[-1]:.1f} s)"
-    figure.suptitle(f"{episode.env}: return {episode.rewards.sum():,.0f} in {length}")
+    figure.suptitle(f"{episode.env}: return {format_score(episode.rewards.sum())} in {length}")
     _frames(figure.add_subplot(grid[0, :]), episode, float(episode.seconds[start]))
     height = figure.add_subplot(grid[1, :])
     moves_in_plane = np.ptp(episode.body[:, 2]) < _NO_HEIGHT

@@ -14,6 +14,7 @@ import numpy as np
 from mjx_walk.envs import View
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import write_text
+from mjx_walk.utils.text import format_score
 from mjx_walk.viewing.episode import Episode
 
 _TEMPLATE = Path(__file__).with_name("page.html")
@@ -45,7 +46,7 @@ def write_page(episode: Episode, path: Path) -> Path:
     model = episode.model
     length = f"{len(episode.rewards)} steps, {episode.seconds[-1]:.1f} s"
     data = {
-        "summary": f"return {episode.rewards.sum():,.0f} in {length}, in the real Gymnasium",
+        "summary": f"return {format_score(episode.rewards.sum())} in {length}, in the real Gymnasium",
         "num_steps": len(episode.rewards),
         "num_bodies": model.nbody,
         "seconds_per_step": episode.seconds_per_step,

@@ -10,6 +10,7 @@ from pathlib import Path
 from mjx_walk.runs.run_folder import RunFolder, open_existing
 from mjx_walk.runs.scores import BEST, read_scores
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.text import format_score
 
 PREFIX = "zoo:"
 
@@ -56,8 +57,8 @@ def table() -> str:
     for name in names():
         scores = read_scores(RunFolder(_FOLDER / name).gymnasium_scores)
         block, facts = scores.blocks[BEST], scores.facts
-        numbers = (block["mean"], block["std"], facts["num_runs"], facts["runs_mean"])
-        cells = [f"`{PREFIX}{name}`", scores.env, *(f"{number:,.0f}" for number in numbers), f"`{facts['command']}`"]
+        mean, std, runs_mean = (format_score(x) for x in (block["mean"], block["std"], facts["runs_mean"]))
+        cells = [f"`{PREFIX}{name}`", scores.env, mean, std, str(facts["num_runs"]), runs_mean, f"`{facts['command']}`"]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
