@@ -129,7 +129,7 @@ def test_runs_of_several_environments_are_normalized(tmp_path):
     fake_run(tmp_path / "ant" / "3", ["env=ant", "seed=3"], [1, 2], 5000.0)  # not scored in the others
     text = suite.write_report(tmp_path).read_text()
     assert "| ppo | final | 2.00 | -0.48 | 4.48 | 2.00 | -0.48 | 4.48 | 4 | 3 |" in text
-    assert "| reacher v5 | ppo | 32.9 | 38.0 | -61.4 | 127.3 | 42.9 | -43.0 | -5.03 | 2.00 |" in text
+    assert "| reacher v5 | ppo | 32.8 | 37.9 | -61.2 | 126.9 | 42.8 | -42.9 | -5.03 | 2.00 |" in text
     assert "| ant v5 | ppo | 3 | 5,000 | 1.00 | 5,010 |" in text
     assert (tmp_path / "comparison.png").read_bytes()[:4] == b"\x89PNG"
     assert len((tmp_path / "comparison.csv").read_text().splitlines()) == 1 + 13
