@@ -78,7 +78,9 @@ def test_there_is_one_time_limit():
 @pytest.mark.parametrize("physics", ["c", pytest.param("jax", marks=pytest.mark.slow)])
 def test_many_side_by_side(physics):
     """Environments that fall or reach the limit reset in the same step. Their last observation is in `final_obs`."""
-    envs = gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=6, physics=physics, max_episode_steps=20)
+    envs = gymnasium.make_vec(
+        "mjx_walk/Walker2d-v5", num_envs=6, physics=physics, max_episode_steps=20, autoreset_mode="SameStep"
+    )
     obs, _ = envs.reset(seed=1)
     again, _ = envs.reset(seed=1)
     np.testing.assert_array_equal(obs, again)
