@@ -84,7 +84,7 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
 
     def close(self) -> None:
         """Close the windows and OpenGL contexts."""
-        self._twin.close()
+        self._close_twin()
 
     def _read_state(self) -> State | None:
         return self._state

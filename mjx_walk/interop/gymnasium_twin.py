@@ -9,7 +9,7 @@ import gymnasium
 import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
-from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
+from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer, OffScreenViewer
 from gymnasium.envs.registration import load_env_creator
 
 from mjx_walk.envs import TASKS, State, TaskOptions
@@ -142,7 +142,21 @@ class MujocoAttributes:
             from mjx_walk.viewing.rendering import choose_opengl
 
             choose_opengl()
-        return self.mujoco_renderer.render(self.render_mode)
+        renderer = self.mujoco_renderer
+        if renderer.viewer is not None:
+            renderer.viewer.make_context_current()  # Gymnasium leaves the context of another environment current
+        return renderer.render(self.render_mode)
+
+    def _close_twin(self) -> None:
+        """Free the OpenGL objects and close the window.
+
+        Gymnasium leaves the objects to the garbage collector, which deletes those of another context instead.
+        """
+        viewer = self._twin.mujoco_renderer.viewer
+        if isinstance(viewer, OffScreenViewer):
+            viewer.make_context_current()
+            viewer.con.free()
+        self._twin.close()
 
     def _show_in_twin(self) -> None:
         self._twin.set_state(*self._position_and_velocity())

@@ -185,7 +185,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the OpenGL contexts."""
-        self._twin.close()
+        self.envs[0]._close_twin()
 
     def _listed_seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
