@@ -12,10 +12,10 @@ TIMES = ("t", "episode_time")
 """Entries that hold wall-clock times."""
 
 
-def make_both(name, make=gymnasium.make, ours=None, **keywords):
-    """An environment of this package on the `c` engine, and Gymnasium's own, with the same keywords."""
+def make_both(name, make=gymnasium.make, ours=None, theirs=None, **keywords):
+    """An environment of this package on the `c` engine, and Gymnasium's own, with the same keywords and their own."""
     with hide_deprecations():
-        return make(f"mjx_walk/{name}", physics="c", **keywords | (ours or {})), make(name, **keywords)
+        return make(f"mjx_walk/{name}", physics="c", **keywords | (ours or {})), make(name, **keywords | (theirs or {}))
 
 
 def assert_same(ours, real, atol=2e-3, path=""):
