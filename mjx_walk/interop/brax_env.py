@@ -1,6 +1,5 @@
 """A task as a `brax.envs.Env`, for Brax's wrappers and trainers and for algorithms written against them."""
 
-import copy
 from typing import Any
 
 import jax
@@ -10,6 +9,7 @@ from brax.envs import base
 from brax.io import mjcf
 
 from mjx_walk.envs import NO_TIME_LIMIT, make_env
+from mjx_walk.envs.physics.mjx_model import with_newton_solver
 from mjx_walk.envs.state import check_action_shape
 from mjx_walk.utils.errors import UserError
 
@@ -41,7 +41,7 @@ class BraxEnv(base.Env):
 
     @property
     def sys(self) -> System:
-        """Brax's description of the model. The control range is that of the actions, [-1, 1].
+        """Brax's description of the model, with MJX's solver. The control range is that of the actions, [-1, 1].
 
         With `physics="jax"`, a changed one can be set, as Brax's `DomainRandomizationVmapWrapper` does. The physics
         uses its values, and rewards that read the model's masses or time step keep the original ones.
@@ -53,7 +53,7 @@ class BraxEnv(base.Env):
             return self._changed_sys
         if self._own_sys is None:
             with jax.ensure_compile_time_eval():
-                sys = mjcf.load_model(copy.deepcopy(self._task.model))
+                sys = mjcf.load_model(with_newton_solver(self._task.model))
                 limits = jnp.tile(jnp.float32([-1.0, 1.0]), (self._task.action_size, 1))
                 self._own_sys = sys.replace(actuator=sys.actuator.replace(ctrl_range=limits))
         return self._own_sys
