@@ -14,9 +14,16 @@ from mjx_walk.envs import NO_TIME_LIMIT, State, make_options
 from mjx_walk.envs.state import check_action_shape
 from mjx_walk.interop.gymnasium_info import single_info
 from mjx_walk.interop.gymnasium_programs import is_forked, make_programs, refuse_fork
-from mjx_walk.interop.gymnasium_twin import RENDER_MODES, MujocoAttributes, make_twin, split_keywords
+from mjx_walk.interop.gymnasium_twin import (
+    RENDER_MODES,
+    MujocoAttributes,
+    make_twin,
+    physics_values,
+    refuse_changes,
+    split_keywords,
+)
 
-_NOT_PICKLED = ("_twin", "_programs")
+_NOT_PICKLED = ("_twin", "_original", "_programs")
 
 
 class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
@@ -50,10 +57,12 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
         if not is_forked():  # a vectorizer may first ask a worker for its spaces
             self._programs = make_programs(self._options, self._physics)
         self._twin = make_twin(self._options, self._rendering)
+        self._original = physics_values(self._twin.model)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Start an episode. A seed gives the start that it gives in Gymnasium, and determines all later episodes."""
         refuse_fork()
+        refuse_changes(self.model, self._original)
         super().reset(seed=seed)
         self._twin.np_random = self.np_random
         self._twin.reset()  # with render_mode="human", it shows the frame as well

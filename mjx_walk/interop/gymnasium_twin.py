@@ -13,6 +13,7 @@ from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer, OffScreenView
 from gymnasium.envs.registration import load_env_creator
 
 from mjx_walk.envs import TASKS, State, TaskOptions
+from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.quiet_mujoco import hide_deprecations
 
 RENDER_KEYWORDS = (
@@ -26,6 +27,10 @@ RENDER_KEYWORDS = (
     "visual_options",
 )
 """Gymnasium's keywords that concern frames."""
+
+_PHYSICS = ("body", "jnt", "dof", "geom", "site", "actuator", "tendon", "eq", "pair")
+_APPEARANCE = ("rgba", "matid", "group", "user")
+"""Prefixes of the model's arrays that its motion depends on, and suffixes of those that only frames show."""
 
 RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple")
 
@@ -49,6 +54,25 @@ def make_twin(options: TaskOptions, rendering: dict[str, Any]) -> MujocoEnv:
         return create(**spec.kwargs | options.gymnasium_kwargs() | rendering)
 
 
+def physics_values(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Copies of the model's values that its motion depends on, by name."""
+    names = [name for name in dir(model) if name.partition("_")[0] in _PHYSICS and not name.endswith(_APPEARANCE)]
+    values = {name: np.array(getattr(model, name)) for name in names if "_" in name}
+    options = [name for name in dir(model.opt) if not name.startswith("_")]
+    return values | {f"opt.{name}": np.array(getattr(model.opt, name)) for name in options}
+
+
+def refuse_changes(model: mujoco.MjModel, original: dict[str, np.ndarray]) -> None:
+    """Check that the model has the values that the physics was compiled with.
+
+    Raises:
+        UserError: it has others.
+    """
+    for name, value in physics_values(model).items():
+        if not np.array_equal(value, original[name]):
+            raise UserError(f"the physics does not read your change of model.{name}; use xml_file=PATH instead")
+
+
 class MujocoAttributes:
     """The attributes of Gymnasium's `MujocoEnv`, except for a live `data`.
 
@@ -68,7 +92,7 @@ class MujocoAttributes:
 
     @property
     def model(self) -> mujoco.MjModel:
-        """A copy of the MuJoCo model, from which frames are rendered."""
+        """A copy of the MuJoCo model, from which frames are rendered. Resets refuse changes of its physics."""
         return self._twin.model
 
     @property

@@ -15,10 +15,10 @@ from mjx_walk.envs.state import check_action_shape
 from mjx_walk.interop.gymnasium_info import add_flags, add_info
 from mjx_walk.interop.gymnasium_programs import make_programs, refuse_fork
 from mjx_walk.interop.gymnasium_sub_env import SubEnv
-from mjx_walk.interop.gymnasium_twin import RENDER_MODES, make_twin, split_keywords
+from mjx_walk.interop.gymnasium_twin import RENDER_MODES, make_twin, physics_values, refuse_changes, split_keywords
 from mjx_walk.utils.errors import UserError
 
-_NOT_PICKLED = ("_twin", "_programs", "envs")
+_NOT_PICKLED = ("_twin", "_original", "_programs", "envs")
 
 
 class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
@@ -75,6 +75,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
     def _build(self) -> None:
         self._programs = make_programs(self._options, self._physics)
         self._twin = make_twin(self._options, self._rendering)
+        self._original = physics_values(self._twin.model)
         self.envs = [SubEnv(self, i) for i in range(self.num_envs)]
 
     @property
@@ -90,6 +91,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
                 continues its sequence of random numbers.
             options: as in `SyncVectorEnv`.
         """
+        refuse_changes(self._twin.model, self._original)
         seeds = self._listed_seeds(seed)
         mask = _checked_mask(options["reset_mask"], self.num_envs) if options and "reset_mask" in options else None
         if mask is not None and self._state is None:

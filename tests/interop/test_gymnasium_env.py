@@ -145,6 +145,15 @@ def test_attributes_of_mujoco_environments():
         ours.set_state(np.zeros(3), np.zeros(9))
 
 
+def test_a_changed_model_is_not_ignored():
+    env = gymnasium.make("mjx_walk/Walker2d-v5", physics="c")
+    env.unwrapped.model.geom_rgba[:] = 1.0
+    env.reset()
+    env.unwrapped.model.body_mass[1] *= 2.0
+    with pytest.raises(UserError, match=r"does not read your change of model\.body_mass; use xml_file=PATH"):
+        env.reset()
+
+
 @renders
 @pytest.mark.parametrize("mode", ["rgb_array", "depth_array", "rgbd_tuple", "rgb_array_list"])
 def test_frames_are_gymnasiums(mode):
