@@ -3,6 +3,8 @@
 Each environment holds the real one, its twin. The twin draws resets and renders, and is never stepped.
 """
 
+import os
+import sys
 from typing import Any
 
 import gymnasium
@@ -47,7 +49,13 @@ def make_twin(options: TaskOptions, rendering: dict[str, Any]) -> MujocoEnv:
     Args:
         options: env options.
         rendering: values of `RENDER_KEYWORDS`.
+
+    Raises:
+        UserError: `render_mode="human"` without a screen, with which Gymnasium ends the process.
     """
+    has_screen = sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
+    if rendering.get("render_mode") == "human" and not has_screen:
+        raise UserError("render_mode='human' needs a screen; use render_mode='rgb_array'")
     spec = gymnasium.spec(f"{TASKS[options.name][0].GYMNASIUM_NAME}-{options.version}")
     create: Any = load_env_creator(str(spec.entry_point))
     with hide_deprecations():

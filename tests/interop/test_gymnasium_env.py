@@ -145,6 +145,14 @@ def test_attributes_of_mujoco_environments():
         ours.set_state(np.zeros(3), np.zeros(9))
 
 
+def test_a_window_needs_a_screen(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(UserError, match="render_mode='human' needs a screen; use render_mode='rgb_array'"):
+        gymnasium.make("mjx_walk/Walker2d-v5", physics="c", render_mode="human")
+
+
 def test_a_changed_model_is_not_ignored():
     env = gymnasium.make("mjx_walk/Walker2d-v5", physics="c")
     env.unwrapped.model.geom_rgba[:] = 1.0
