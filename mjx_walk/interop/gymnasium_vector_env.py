@@ -43,8 +43,8 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
             num_envs: number of environments, B.
             env: name of the task.
             physics: engine.
-            autoreset_mode: when a finished environment resets, as in `SyncVectorEnv`: in the next step, in the same
-                step, or only if `reset` is told so.
+            autoreset_mode: as in `SyncVectorEnv`, finished environments reset in the next step, in the same step, or
+                only when `reset` is called.
             keywords: Gymnasium's, and those of `TaskOptions`.
 
         Raises:
@@ -150,7 +150,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
     def _add_final(
         self, info: dict[str, Any], last_obs: np.ndarray, step_info: dict, metrics: dict, is_over: np.ndarray
     ) -> None:
-        """Add what `SyncVectorEnv` tells of episodes that end in this step: an object array of observations."""
+        """Add `final_obs`, an object array, and `final_info` of the episodes that end in this step."""
         final_obs = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(is_over):
             final_obs[i] = np.array(last_obs[i], np.float64)
@@ -222,11 +222,11 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
 
 
 def _checked_mask(mask: Any, num_envs: int) -> np.ndarray:
-    """`reset_mask`, with the errors of `SyncVectorEnv`.
+    """Check a `reset_mask` as `SyncVectorEnv` does.
 
     Raises:
-        TypeError: it is no array of bools.
-        ValueError: it has another shape than `[num_envs]`, or selects no environment.
+        TypeError: the mask is not an array of bools.
+        ValueError: its shape is not `[num_envs]`, or it selects no environment.
     """
     if not isinstance(mask, np.ndarray):
         raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")

@@ -145,6 +145,15 @@ def test_attributes_of_mujoco_environments():
         ours.set_state(np.zeros(3), np.zeros(9))
 
 
+def test_info_says_that_the_physics_is_not_finite():
+    """Gymnasium has no such entry, and resets the simulation in silence."""
+    env = gymnasium.make("mjx_walk/HalfCheetah-v5", physics="c").unwrapped
+    env.reset(seed=0)
+    env.set_state(env.init_qpos, np.full(9, 9e9))
+    _, reward, terminated, _, info = env.step(np.zeros(6))
+    assert terminated and reward == 0.0 and info["nonfinite"] == 1.0
+
+
 def test_a_window_needs_a_screen(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
