@@ -41,7 +41,7 @@ def add_info(target: dict[str, Any], info: dict[str, Any], mask: np.ndarray) -> 
         return
     for name, value in info.items():
         value = np.asarray(value)
-        dtype = value.dtype if np.issubdtype(value.dtype, np.integer) else np.float64
+        dtype = np.int64 if np.issubdtype(value.dtype, np.integer) else np.float64
         target.setdefault(name, np.zeros(value.shape, dtype))[mask] = value[mask]
         target.setdefault(f"_{name}", np.zeros(mask.shape, np.bool_))[mask] = True
 

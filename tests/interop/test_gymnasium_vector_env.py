@@ -116,6 +116,16 @@ def test_copies_and_attributes():
     np.testing.assert_array_equal(envs.call("state_vector"), np.float32([before[0], before[0] + 0.5]))
 
 
+def test_entries_have_the_dtypes_of_gymnasium():
+    """Among them an integer: the reward of a pendulum."""
+    ours, real = make_both("InvertedPendulum-v5", gymnasium.make_vec, num_envs=2, reset_noise_scale=0.0)
+    for env in (ours, real):
+        env.reset()
+    found, expected = (env.step(np.zeros((2, 1))) for env in (ours, real))
+    assert_same(found, expected)
+    assert found[4]["reward_survive"].dtype == expected[4]["reward_survive"].dtype == np.int64
+
+
 @renders
 def test_frames():
     envs = gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=2, render_mode="rgb_array", width=64, height=48)
