@@ -23,8 +23,9 @@ from mjx_walk.envs.pusher import Pusher, PusherOptions
 from mjx_walk.envs.reacher import Reacher, ReacherOptions
 from mjx_walk.envs.state import NO_TIME_LIMIT, State, TrainableTask
 from mjx_walk.envs.swimmer import Swimmer, SwimmerOptions
-from mjx_walk.envs.task import Task, View
+from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions, with_absolute_paths
+from mjx_walk.envs.view import View
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.utils.compat import prepare_jax
 from mjx_walk.utils.errors import UserError
@@ -53,6 +54,7 @@ __all__ = [
     "TrainableTask",
     "View",
     "make_env",
+    "make_options",
     "with_absolute_paths",
 ]
 
@@ -70,9 +72,19 @@ def make_env(name: str, physics: str = "auto", **kwargs: Any) -> Task:
         UserError: an unknown name, engine, version or option, or an invalid value.
     """
     prepare_jax()
+    options = make_options(name, **kwargs)
+    return TASKS[name][0](options, physics)
+
+
+def make_options(name: str, **kwargs: Any) -> TaskOptions:
+    """Env options of a task, checked. See `make_env`.
+
+    Raises:
+        UserError: an unknown name or option, or an invalid value.
+    """
     if name not in TASKS:
         raise UserError(f"unknown env '{name}'; choose one of: {', '.join(TASKS)}")
-    task_class, options_class = TASKS[name]
+    options_class = TASKS[name][1]
     known = [field.name for field in dataclasses.fields(options_class) if field.name != "name"]
     for option in kwargs:
         if option not in known:
@@ -81,4 +93,4 @@ def make_env(name: str, physics: str = "auto", **kwargs: Any) -> Task:
             raise UserError(f"{name} has no option '{option}'; {hint}valid: {', '.join(known)}")
     options = with_absolute_paths(options_class(**kwargs), Path.cwd())
     validate(options)
-    return task_class(options, physics)
+    return options

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.info import Info, plane_position, plane_velocity
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_normal_velocity
 from mjx_walk.envs.reward_shaping import Terms
@@ -129,3 +130,11 @@ class Ant(Task):
                 # As in Gymnasium, v4's `reward_ctrl` is then the contact cost; the control cost gets a name of ours.
                 terms |= {"reward_ctrl": contact, "reward_quadctrl": terms["reward_ctrl"]}
         return terms, sum(terms.values(), jnp.float32(0.0)), ~is_healthy & options.terminate_when_unhealthy
+
+    def position_info(self, state: State) -> Info:
+        """The root's position in v5, and the torso's in v4, which is that of the last forward pass."""
+        return plane_position(state.physics.qpos[:2] if self.options.version == "v5" else state.memory["main_body"])
+
+    def velocity_info(self, before: State, after: State) -> Info:
+        velocity = (after.memory["main_body"] - before.memory["main_body"]) / self.dt
+        return plane_velocity(velocity) | ({"forward_reward": velocity[0]} if self.options.version == "v4" else {})

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.info import Info
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_normal_velocity
 from mjx_walk.envs.reward_shaping import Terms
@@ -66,3 +67,9 @@ class HalfCheetah(Task):
             control: -options.ctrl_cost_weight * jnp.square(action).sum(),
         }
         return terms, sum(terms.values(), jnp.float32(0.0)), jnp.zeros((), bool)
+
+    def position_info(self, state: State) -> Info:
+        return {"x_position": state.physics.qpos[0]}
+
+    def velocity_info(self, before: State, after: State) -> Info:
+        return {"x_velocity": (after.physics.qpos[0] - before.physics.qpos[0]) / self.dt}

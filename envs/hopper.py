@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.info import Info
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
@@ -44,6 +45,7 @@ class Hopper(Task):
     GYMNASIUM_NAME = "Hopper"
     XML_FILES = {"v5": "hopper.xml", "v4": "hopper.xml"}
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_forward", "reward_ctrl", "reward_survive"))
+    V4_INFO_HAS_TERMS = False
     HAS_Y = False
     HEIGHT_INDEX = 1
 
@@ -86,6 +88,14 @@ class Hopper(Task):
             "reward_survive": options.healthy_reward * is_paid,
         }
         return terms, sum(terms.values(), jnp.float32(0.0)), ~is_healthy & options.terminate_when_unhealthy
+
+    def position_info(self, state: State) -> Info:
+        x, z = state.physics.qpos[:2]
+        height = {"z_distance_from_origin": z - self.init_qpos[1]} if self.options.version == "v5" else {}
+        return {"x_position": x} | height
+
+    def velocity_info(self, before: State, after: State) -> Info:
+        return {"x_velocity": (after.physics.qpos[0] - before.physics.qpos[0]) / self.dt}
 
 
 def _is_within(value: Float[Array, "*shape"], bounds: tuple[float, float]) -> Bool[Array, "*shape"]:

@@ -7,6 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from mjx_walk.envs.humanoid_body import HumanoidBody, HumanoidBodyOptions
+from mjx_walk.envs.info import Info, plane_position, plane_velocity
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
@@ -80,3 +81,14 @@ class Humanoid(HumanoidBody):
                 "reward_contact": contact,
             }
         return terms, sum(terms.values(), jnp.float32(0.0)), terminated
+
+    def position_info(self, state: State) -> Info:
+        """The root's position and the tendons in v5, and the center of mass in v4."""
+        if self.options.version == "v4":
+            return plane_position(state.memory["mass_center"])
+        return plane_position(state.physics.qpos[:2]) | self.tendon_info(state)
+
+    def velocity_info(self, before: State, after: State) -> Info:
+        velocity = (after.memory["mass_center"] - before.memory["mass_center"]) / self.dt
+        forward = {"forward_reward": self.options.forward_reward_weight * velocity[0]}
+        return plane_velocity(velocity) | (forward if self.options.version == "v4" else {})

@@ -7,8 +7,10 @@ import mujoco
 from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
+from mjx_walk.envs.info import Info
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
+from mjx_walk.envs.state import State
 from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.settings import setting
@@ -86,3 +88,10 @@ class HumanoidBody(Task):
     def contact_cost(self, derived: Derived, weight: float, bounds: tuple[float, float]) -> Float[Array, ""]:
         """Weighted sum of the squared contact forces on all bodies, clipped to `bounds`."""
         return jnp.clip(weight * jnp.square(derived["cfrc_ext"]).sum(), *bounds)
+
+    def info_arrays(self) -> tuple[str, ...]:
+        return ("ten_length", "ten_velocity") if self.options.version == "v5" else ()
+
+    def tendon_info(self, state: State) -> Info:
+        """Lengths, rad, and velocities, rad/s, of the two tendons of hip and knee, `[2]` each."""
+        return {"tendon_length": state.memory["ten_length"], "tendon_velocity": state.memory["ten_velocity"]}

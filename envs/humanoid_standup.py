@@ -7,6 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from mjx_walk.envs.humanoid_body import HumanoidBody, HumanoidBodyOptions
+from mjx_walk.envs.info import Info
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
@@ -44,6 +45,8 @@ class HumanoidStandup(HumanoidBody):
         "impact_cost_range",
     )
 
+    REWARD_OFFSET = 1.0
+
     options: HumanoidStandupOptions
 
     def reward_and_termination(
@@ -56,4 +59,11 @@ class HumanoidStandup(HumanoidBody):
             "reward_quadctrl": -options.ctrl_cost_weight * jnp.square(action).sum(),
             "reward_impact": -self.contact_cost(derived, options.impact_cost_weight, options.impact_cost_range),
         }
-        return terms, sum(terms.values(), jnp.float32(0.0)) + 1.0, jnp.zeros((), bool)
+        return terms, sum(terms.values(), jnp.float32(0.0)) + self.REWARD_OFFSET, jnp.zeros((), bool)
+
+    def position_info(self, state: State) -> Info:
+        if self.options.version == "v4":
+            return {}
+        x, y, z = state.physics.qpos[:3]
+        height = {"z_distance_from_origin": z - self.init_qpos[2]}
+        return {"x_position": x, "y_position": y} | height | self.tendon_info(state)

@@ -10,8 +10,9 @@ from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_normal_velocity
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
-from mjx_walk.envs.task import Task, View
+from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.view import View
 from mjx_walk.utils.settings import setting
 
 MAX_OBSERVED_VELOCITY = 10.0
@@ -38,6 +39,7 @@ class InvertedDoublePendulum(Task):
     GYMNASIUM_NAME = "InvertedDoublePendulum"
     XML_FILES = {"v5": "inverted_double_pendulum.xml", "v4": "inverted_double_pendulum.xml"}
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_survive", "distance_penalty", "velocity_penalty"))
+    V4_INFO_HAS_TERMS = False
     V5_ONLY = (*Task.V5_ONLY, "healthy_reward", "reset_noise_scale")
     HAS_Y = False
     VIEW = View(body=3, center=(0.0, 0.0, 0.5))

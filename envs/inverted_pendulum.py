@@ -6,12 +6,14 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.info import Info
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
-from mjx_walk.envs.task import Task, View
+from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.view import View
 from mjx_walk.utils.settings import setting
 
 MAX_ANGLE = 0.2
@@ -36,6 +38,7 @@ class InvertedPendulum(Task):
     GYMNASIUM_NAME = "InvertedPendulum"
     XML_FILES = {"v5": "inverted_pendulum.xml", "v4": "inverted_pendulum.xml"}
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_survive",))
+    V4_INFO_HAS_TERMS = False
     V5_ONLY = (*Task.V5_ONLY, "reset_noise_scale")
     HAS_Y = False
     VIEW = View(body=2, center=(0.0, 0.0, 0.2), distance=2.5)
@@ -66,3 +69,8 @@ class InvertedPendulum(Task):
         # v4 also pays in the step that terminates the episode.
         reward = jnp.float32(~terminated | (self.options.version == "v4"))
         return {"reward_survive": reward}, reward, terminated
+
+    def step_info(self, before: State, after: State) -> Info:
+        """As in Gymnasium, v5's term is an integer, `[] i32`."""
+        info = super().step_info(before, after)
+        return info if self.has_custom_reward else {name: jnp.int32(value) for name, value in info.items()}

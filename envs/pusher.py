@@ -11,8 +11,9 @@ from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
-from mjx_walk.envs.task import Task, View
+from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.view import View
 from mjx_walk.utils.settings import setting
 
 VELOCITY_NOISE = 5e-3

@@ -1,9 +1,10 @@
 """The contract between tasks and trainers: the state of an environment, and what a trainer needs of a task."""
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import flax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
@@ -34,6 +35,16 @@ class State(flax.struct.PyTreeNode):
     """`[] i32`: steps since the reset."""
     metrics: dict[str, Array]
     """`[] f32` each: the reward terms under the names of Gymnasium's `info`, `nonfinite` and `overflow`."""
+
+
+def check_action_shape(action: Any, expected: tuple[int, ...]) -> None:
+    """Check an action before it is broadcast or converted.
+
+    Raises:
+        ValueError: it has another shape; Gymnasium's message.
+    """
+    if np.shape(action) != expected:
+        raise ValueError(f"Action dimension mismatch. Expected {expected}, found {np.shape(action)}")
 
 
 class TrainableTask(Protocol):

@@ -6,12 +6,14 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.info import Info, plane_position, plane_velocity
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
-from mjx_walk.envs.task import Task, View
+from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.view import View
 from mjx_walk.utils.settings import setting
 
 
@@ -66,3 +68,11 @@ class Swimmer(Task):
             control: -options.ctrl_cost_weight * jnp.square(action).sum(),
         }
         return terms, sum(terms.values(), jnp.float32(0.0)), jnp.zeros((), bool)
+
+    def position_info(self, state: State) -> Info:
+        return plane_position(state.physics.qpos[:2])
+
+    def velocity_info(self, before: State, after: State) -> Info:
+        velocity = (after.physics.qpos[:2] - before.physics.qpos[:2]) / self.dt
+        forward = {"forward_reward": self.options.forward_reward_weight * velocity[0]}
+        return plane_velocity(velocity) | (forward if self.options.version == "v4" else {})

@@ -1,7 +1,7 @@
 """What all Gymnasium tasks share: model, engine, resets, finiteness check, time limit."""
 
 import abc
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,38 +9,22 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.info import GymnasiumInfo
 from mjx_walk.envs.models import body_id, load_model, motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_files import load_reward_function
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, shaping_terms, term_names
-from mjx_walk.envs.state import Carry, State, TrainableTask
+from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape
 from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.view import View
 from mjx_walk.utils.errors import UserError
 
 MAX_ABS_VALUE = 1e10
 """Largest valid position or velocity, as in MuJoCo's own check (`mjMAXVAL`)."""
 
-_NOT_IN_GYMNASIUM = ("name", "version", "max_episode_steps", "shaping", "reward_function")
-"""Fields of `TaskOptions` that the constructors of Gymnasium's classes do not take."""
 
-
-class View(NamedTuple):
-    """What films, pages and gait sheets show of a task."""
-
-    body: int = 1
-    """Body whose height and speed they show. In Gymnasium's models, body 1 is the root, and the world is body 0."""
-    center: tuple[float, float, float] | None = None
-    """Point that the camera looks at, m. Default: the camera follows the body."""
-    distance: float = 4.0
-    """From the camera to its center, m."""
-    elevation: float = -8.0
-    """Angle of the line of sight above the horizon, degrees; -90 looks straight down."""
-    azimuth: float = 90.0
-    """Direction of the line of sight, degrees; 0 looks along x, 90 along y."""
-
-
-class Task(TrainableTask, abc.ABC):
+class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     """A Gymnasium MuJoCo environment as pure functions of `State`.
 
     Subclasses define observations, rewards and terminations. They do not depend on the engine.
@@ -66,11 +50,13 @@ class Task(TrainableTask, abc.ABC):
     """Index of the root's height in `qpos`. None: the root cannot leave the ground."""
     VIEW: View = View()
 
-    def __init__(self, options: TaskOptions, physics: str = "auto"):
+    def __init__(self, options: TaskOptions, physics: str = "auto", keep_info: bool = False):
         """
         Args:
             options: env options.
             physics: name of the engine, or `auto`.
+            keep_info: whether `State.memory` also holds the arrays of `info_arrays`. `reset_info` and `step_info` need
+                them, training does not.
 
         Raises:
             UserError: an unknown version or engine, an option that the version does not take, shaping that has no
@@ -81,7 +67,9 @@ class Task(TrainableTask, abc.ABC):
         self.max_episode_steps = options.max_episode_steps
         self.model = load_model(options.xml_file or self.XML_FILES[options.version])
         self.dt = self.model.opt.timestep * options.frame_skip
-        self.engine = make_engine(resolve_engine(physics), self.model, options.frame_skip, self.derived_names())
+        self.kept_arrays = self.info_arrays() if keep_info else ()
+        derived = tuple(dict.fromkeys((*self.derived_names(), *self.kept_arrays)))
+        self.engine = make_engine(resolve_engine(physics), self.model, options.frame_skip, derived)
         low, high = self.model.actuator_ctrlrange.T
         self.action_low, self.action_high = jnp.float32(low), jnp.float32(high)
         self.action_size = self.model.nu
@@ -94,6 +82,10 @@ class Task(TrainableTask, abc.ABC):
         self._reward_function = load_reward_function(options.reward_function) if options.reward_function else None
         self.reward_terms = self._reward_term_names()
         self.metric_names = (*self.reward_terms, "nonfinite", "overflow")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle and copy a task as its arguments: engines hold threads and compiled functions."""
+        return type(self), (self.options, self.engine.name, bool(self.kept_arrays))
 
     def _check_shaping(self) -> None:
         name, shaping = self.options.name, self.options.shaping
@@ -111,7 +103,7 @@ class Task(TrainableTask, abc.ABC):
 
     def gymnasium_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of `gymnasium.make` for the equivalent environment, without those at their default."""
-        return {name: value for name, value in self.options.changed().items() if name not in _NOT_IN_GYMNASIUM}
+        return self.options.gymnasium_kwargs()
 
     @property
     def reward_hashes(self) -> dict[str, str]:
@@ -201,7 +193,7 @@ class Task(TrainableTask, abc.ABC):
         derived = self.engine.forward(physics)
         return State(
             physics=physics,
-            memory=self.carry(physics, derived),
+            memory=self.carry(physics, derived) | self._kept(derived),
             obs=self.observe(physics, derived),
             reward=jnp.zeros((), jnp.float32),
             terminated=jnp.zeros((), bool),
@@ -220,10 +212,14 @@ class Task(TrainableTask, abc.ABC):
         Returns:
             The next state. If the physics are not finite or exceed `MAX_ABS_VALUE`, the episode ends: `terminated` and
             `metrics["nonfinite"]` are set, the reward is zero, and the physics state and observation stay unchanged.
+
+        Raises:
+            ValueError: the action has another shape. A traced step raises it while it is traced.
         """
+        check_action_shape(action, (self.action_size,))
         action = jnp.asarray(action, jnp.float32)
         physics, derived, overflow = self.engine.step(state.physics, action)
-        carry = self.carry(physics, derived)
+        carry = self.carry(physics, derived) | self._kept(derived)
         obs = self.observe(physics, derived)
         terms, reward, terminated = self.reward_and_termination(state, physics, derived, carry, action)
         terms, reward = self._customize_reward(
@@ -252,6 +248,9 @@ class Task(TrainableTask, abc.ABC):
             steps=steps,
             metrics=terms | {"nonfinite": jnp.float32(~is_finite), "overflow": jnp.float32(overflow)},
         )
+
+    def _kept(self, derived: Derived) -> Carry:
+        return {name: derived[name] for name in self.kept_arrays}
 
     def _customize_reward(self, step: RewardStep) -> tuple[Terms, Float[Array, ""]]:
         """Reward terms and reward after `reward_function` and `shaping` are applied."""

@@ -41,6 +41,14 @@ class TaskOptions:
         defaults = vars(type(self)())
         return {name: value for name, value in vars(self).items() if value != defaults[name]}
 
+    def gymnasium_kwargs(self) -> dict[str, Any]:
+        """Keyword arguments of Gymnasium's class for the equivalent environment, without those at their default."""
+        return {name: value for name, value in self.changed().items() if name not in _NOT_IN_GYMNASIUM}
+
+
+_NOT_IN_GYMNASIUM = ("name", "version", "max_episode_steps", "shaping", "reward_function")
+"""Fields of `TaskOptions` that the constructors of Gymnasium's classes do not take."""
+
 
 def with_absolute_paths(options: TaskOptions, folder: Path) -> TaskOptions:
     """Options whose files stay the same ones when a run is loaded from another working directory.

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.info import Info
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
@@ -45,6 +46,7 @@ class Walker2d(Task):
     HAS_Y = False
     HEIGHT_INDEX = 1
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_forward", "reward_ctrl", "reward_survive"))
+    V4_INFO_HAS_TERMS = False
 
     options: Walker2dOptions
 
@@ -83,3 +85,11 @@ class Walker2d(Task):
             "reward_survive": options.healthy_reward * is_paid,
         }
         return terms, sum(terms.values(), jnp.float32(0.0)), ~is_healthy & options.terminate_when_unhealthy
+
+    def position_info(self, state: State) -> Info:
+        x, z = state.physics.qpos[:2]
+        height = {"z_distance_from_origin": z - self.init_qpos[1]} if self.options.version == "v5" else {}
+        return {"x_position": x} | height
+
+    def velocity_info(self, before: State, after: State) -> Info:
+        return {"x_velocity": (after.physics.qpos[0] - before.physics.qpos[0]) / self.dt}

@@ -12,12 +12,14 @@ from mjx_walk.utils.files import replacing
 from mjx_walk.utils.settings import setting
 
 USAGE = """
-usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [format=onnx] [out=FILE.onnx]
+usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [format=onnx] [dtype=float64|float32]
+                                 [out=FILE.onnx]
 
   policy=best     the policy with the highest evaluation during training; policy=final is the newest one
   out=FILE.onnx   by default RUN_DIR/policy.onnx, or NAME.onnx in the current folder for a policy of the zoo. The model
-                  maps `observation`, [N, observation_size] f64, to `action`, [N, action_size] f32, both in Gymnasium's
+                  maps `observation`, [N, observation_size], to `action`, [N, action_size] f32, both in Gymnasium's
                   units. It normalises observations itself.
+  dtype=float64   of `observation`: Gymnasium's observations are float64
 """
 
 
@@ -26,6 +28,7 @@ class Arguments:
     run: str | None = None
     policy: str = setting(BEST, choices=POLICIES)
     format: str = setting("onnx", choices=("onnx",))
+    dtype: str = setting("float64", choices=("float64", "float32"))
     out: str | None = None
 
 
@@ -43,7 +46,8 @@ def main(command_line: list[str]) -> None:
     run = load_run(folder.path, "c", arguments.policy)
     path = Path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.onnx")
     cli.check_writable(path)
-    model = translate(run.act, run.task.observation_size, f"{run.config.env.name}_{run.config.algo.name}")
+    name = f"{run.config.env.name}_{run.config.algo.name}"
+    model = translate(run.act, run.task.observation_size, name, arguments.dtype)
     with replacing(path) as new:
         onnx.save(model, str(new))
     print(f"{path}: observation [N, {run.task.observation_size}] → action [N, {run.task.action_size}]")

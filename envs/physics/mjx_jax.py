@@ -29,11 +29,20 @@ class JaxEngine:
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
         capsule_frames_jax.install()
         model = with_newton_solver(model)
-        self._model = mjx.put_model(model, impl="jax")
+        self._model = self._own_model = mjx.put_model(model, impl="jax")
         self._blank = mjx.make_data(model, impl="jax")
         self._substep = _runge_kutta_4 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else _euler
         self._num_substeps = num_substeps
         self._derived = derived
+
+    def change_model(self, changes: dict[str, Array]) -> None:
+        """Step a changed model from now on, for domain randomization. A program compiled before keeps its model.
+
+        Args:
+            changes: new values of `mjx.Model` by their paths, such as `body_mass` or `opt.gravity`, in the shapes of
+                the old ones. They may be traced. An empty dict restores the model.
+        """
+        self._model = self._own_model.tree_replace(changes) if changes else self._own_model
 
     def _data(self, state: PhysicsState) -> mjx.Data:
         return self._blank.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)

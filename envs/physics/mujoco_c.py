@@ -3,6 +3,7 @@
 import functools
 import itertools
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -37,6 +38,7 @@ class CEngine:
         self._derived_shapes = {name: np.shape(getattr(blank, name)) for name in derived}
         self._num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._workspaces = [mujoco.MjData(model) for _ in range(self._num_threads)]
+        self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(self._num_threads, thread_name_prefix="mujoco")
         self.forward = batch_once(self._forward)
         self.step = batch_once(self._step)
@@ -114,7 +116,8 @@ class CEngine:
         bounds = np.linspace(0, num_envs, num_threads + 1).astype(int)
         ranges = [range(start, stop) for start, stop in itertools.pairwise(bounds)]
         run = functools.partial(_for_range, function)
-        list((map if num_threads == 1 else self._pool.map)(run, self._workspaces, ranges))
+        with self._lock:  # several threads may step environments of one engine
+            list((map if num_threads == 1 else self._pool.map)(run, self._workspaces, ranges))
 
 
 def _for_range(function: Callable[[mujoco.MjData, int], None], data: mujoco.MjData, indices: range) -> None:

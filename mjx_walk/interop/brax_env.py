@@ -4,9 +4,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from brax.base import System
 from brax.envs import base
+from brax.io import mjcf
 
 from mjx_walk.envs import NO_TIME_LIMIT, make_env
+from mjx_walk.envs.physics.mjx_model import with_newton_solver
+from mjx_walk.envs.state import check_action_shape
+from mjx_walk.utils.errors import UserError
 
 
 class BraxEnv(base.Env):
@@ -26,14 +31,67 @@ class BraxEnv(base.Env):
             UserError: an unknown name, engine or keyword.
         """
         self._task = make_env(env, physics, **keywords | {"max_episode_steps": NO_TIME_LIMIT})
+        self._own_sys: System | None = None
+        self._changed_sys: System | None = None
+
+    @property
+    def dt(self) -> float:
+        """Duration of a step, s."""
+        return self._task.dt
+
+    @property
+    def sys(self) -> System:
+        """Brax's description of the model, with MJX's solver. The control range is that of the actions, [-1, 1].
+
+        With `physics="jax"`, a changed one can be set, as Brax's `DomainRandomizationVmapWrapper` does. The physics
+        uses its values, and rewards that read the model's masses or time step keep the original ones.
+
+        Raises:
+            UserError: on setting a changed one with another engine.
+        """
+        if self._changed_sys is not None:
+            return self._changed_sys
+        if self._own_sys is None:
+            with jax.ensure_compile_time_eval():
+                sys = mjcf.load_model(with_newton_solver(self._task.model))
+                limits = jnp.tile(jnp.float32([-1.0, 1.0]), (self._task.action_size, 1))
+                self._own_sys = sys.replace(actuator=sys.actuator.replace(ctrl_range=limits))
+        return self._own_sys
+
+    @sys.setter
+    def sys(self, sys: System) -> None:
+        own = dict(jax.tree_util.tree_leaves_with_path(self._restored_sys()))
+        leaves = jax.tree_util.tree_leaves_with_path(sys)
+        changes = {_dotted(path): leaf for path, leaf in leaves if leaf is not own[path]}
+        if not changes:
+            return
+        self._change_model(changes)
+        self._changed_sys = sys
+
+    def _restored_sys(self) -> System:
+        if self._changed_sys is not None:
+            self._change_model({})
+            self._changed_sys = None
+        return self.sys
+
+    def _change_model(self, changes: dict[str, jax.Array]) -> None:
+        engine: Any = self._task.engine
+        if self.backend != "jax":
+            raise UserError(f"physics={self.backend} cannot change its model; use BraxEnv(…, physics='jax')")
+        engine.change_model(changes)
 
     def reset(self, rng: jax.Array) -> base.State:
         """Start an episode at random. `pipeline_state` holds this package's `State`."""
         state = self._task.reset(rng)
-        return base.State(state, state.obs, state.reward, jnp.zeros(()), state.metrics)
+        return base.State(state, state.obs, state.reward, jnp.zeros((), jnp.float32), state.metrics)
 
     def step(self, state: base.State, action: jax.Array) -> base.State:
-        """Step once. `done` means that the task ended the episode; the time limit never sets it."""
+        """Step once. `done` means that the task ended the episode; the time limit never sets it.
+
+        Raises:
+            ValueError: the action has another shape than `[action_size]`.
+        """
+        check_action_shape(action, (self.action_size,))
         after = self._task.step(state.pipeline_state, self._task.scale_action(action))
         return state.replace(
             pipeline_state=after,
@@ -54,3 +112,8 @@ class BraxEnv(base.Env):
     @property
     def backend(self) -> str:
         return self._task.engine.name
+
+
+def _dotted(path: tuple[Any, ...]) -> str:
+    """Path of a leaf as `tree_replace` takes it, such as `opt.gravity`."""
+    return ".".join(key.name for key in path)

@@ -1,24 +1,38 @@
 """The tasks as Gymnasium environments: `gymnasium.make("mjx_walk/Humanoid-v5")`.
 
-They run on any engine (`physics=`) and take Gymnasium's keywords. Observations and rewards are float32.
+They run on any engine (`physics=`), take Gymnasium's keywords, and behave as Gymnasium's own. Observations are float64
+arrays, as there, that hold float32 values.
 """
 
 from typing import Any
 
 import gymnasium
 import jax
-import jax.numpy as jnp
 import numpy as np
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
 
-from mjx_walk.envs import NO_TIME_LIMIT, State, Task, make_env
+from mjx_walk.envs import NO_TIME_LIMIT, State, make_options
+from mjx_walk.envs.state import check_action_shape
+from mjx_walk.interop.gymnasium_info import single_info
+from mjx_walk.interop.gymnasium_programs import is_forked, make_programs, refuse_fork
+from mjx_walk.interop.gymnasium_twin import (
+    RENDER_MODES,
+    MujocoAttributes,
+    make_twin,
+    physics_values,
+    refuse_changes,
+    split_keywords,
+)
+
+_NOT_PICKLED = ("_twin", "_original", "_programs")
 
 
-class MjxWalkEnv(gymnasium.Env):
-    """One environment. `gymnasium.make` adds the time limit as a wrapper."""
+class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
+    """One environment. `gymnasium.make` adds the time limit as a wrapper.
 
-    metadata = {"render_modes": []}
+    Copies and pickles keep the state and the random generator.
+    """
+
+    metadata = {"render_modes": list(RENDER_MODES)}
 
     def __init__(self, env: str, physics: str = "auto", **keywords: Any):
         """
@@ -26,99 +40,72 @@ class MjxWalkEnv(gymnasium.Env):
             env: name of the task.
             physics: engine.
             keywords: Gymnasium's, and those of `TaskOptions`.
+
+        Raises:
+            UserError: an unknown name, engine or keyword.
         """
-        task = make_env(env, physics, **keywords | {"max_episode_steps": NO_TIME_LIMIT})
-        self.observation_space, self.action_space = _spaces(task)
-        self._reset, self._step = jax.jit(task.reset), jax.jit(task.step)
+        options, self._rendering = split_keywords(keywords)
+        self._options = make_options(env, **options | {"max_episode_steps": NO_TIME_LIMIT})
+        self._physics = physics
         self._state: State | None = None
+        self._build()
+        self.metadata = self._twin.metadata | {"render_fps": round(1.0 / self._twin.dt)}
+        self.render_mode = self._twin.render_mode
+        self.observation_space, self.action_space = self._twin.observation_space, self._twin.action_space
+
+    def _build(self) -> None:
+        if not is_forked():  # a vectorizer may first ask a worker for its spaces
+            self._programs = make_programs(self._options, self._physics)
+        self._twin = make_twin(self._options, self._rendering)
+        self._original = physics_values(self._twin.model)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Start an episode at random. `seed` also determines all later episodes."""
+        """Start an episode. A seed gives the start that it gives in Gymnasium, and determines all later episodes."""
+        refuse_fork()
+        refuse_changes(self.model, self._original)
         super().reset(seed=seed)
-        self._state = self._reset(_draw_key(self.np_random))
-        return np.asarray(self._state.obs), {}
+        self._twin.np_random = self.np_random
+        self._twin.reset()  # with render_mode="human", it shows the frame as well
+        data = self._twin.data
+        self._state, info = self._programs.reset_to(np.float32(data.qpos), np.float32(data.qvel))
+        return np.array(self._state.obs, np.float64), single_info(jax.device_get(info))
 
     def step(self, action):
-        """Step once. `info` holds the reward terms."""
-        if self._state is None:
-            raise gymnasium.error.ResetNeeded("call reset before step")
-        self._state = self._step(self._state, jnp.asarray(action, jnp.float32))
-        state = jax.device_get(self._state)
-        info = {name: float(value) for name, value in state.metrics.items()}
-        return state.obs, float(state.reward), bool(state.terminated), False, info
+        """Step once.
 
-
-class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
-    """Many environments in one compiled program.
-
-    Finished environments reset in the same step. Their last observation is in `info["final_obs"]`.
-    """
-
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
-
-    def __init__(self, num_envs: int, env: str, physics: str = "auto", **keywords: Any):
-        """
         Args:
-            num_envs: number of environments, B.
-            env: name of the task.
-            physics: engine.
-            keywords: Gymnasium's, and those of `TaskOptions`.
+            action: `[action_size]`, in Gymnasium's units.
+
+        Raises:
+            ValueError: the action has another shape.
         """
-        self.num_envs = num_envs
-        self._task = make_env(env, physics, **keywords)
-        self.single_observation_space, self.single_action_space = _spaces(self._task)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self._reset, self._step = jax.jit(jax.vmap(self._task.reset)), jax.jit(self._step_and_reset)
-        self._state: State | None = None
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Start all episodes at random. `seed` also determines all later episodes."""
-        super().reset(seed=seed)
-        self._state = self._reset(self._draw_keys())
-        return np.asarray(self._state.obs), {}
-
-    def step(self, actions):
-        """Step all environments. `info` holds the reward terms, `[B]` each."""
+        refuse_fork()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        self._state, before_reset = self._step(self._state, jnp.asarray(actions, jnp.float32), self._draw_keys())
-        last = jax.device_get(before_reset)
-        is_over = last.terminated | last.truncated
-        info: dict[str, Any] = dict(last.metrics)
-        if is_over.any():
-            # Gymnasium's own vector environments have this layout: one object per environment, None while it runs.
-            final_obs = np.full(self.num_envs, None, dtype=object)
-            for i in np.flatnonzero(is_over):
-                final_obs[i] = last.obs[i]
-            info |= {"final_obs": final_obs, "_final_obs": is_over}
-            info |= {"final_info": dict(last.metrics), "_final_info": is_over}
-        return np.asarray(self._state.obs), last.reward, last.terminated, last.truncated, info
+        check_action_shape(action, (self._twin.model.nu,))
+        self._state, info = self._programs.step(self._state, np.asarray(action, np.float32))
+        state, info = jax.device_get((self._state, info))
+        if self.render_mode == "human":
+            self.render()
+        reward = np.float64(self._programs.reward(state))
+        info = single_info(info, state.metrics)
+        return np.array(state.obs, np.float64), reward, bool(state.terminated), False, info
 
-    def _draw_keys(self) -> jax.Array:
-        return jax.random.split(_draw_key(self.np_random), self.num_envs)
+    def close(self) -> None:
+        """Close the windows and OpenGL contexts."""
+        self._close_twin()
 
-    def _step_and_reset(self, state: State, action: jax.Array, keys: jax.Array) -> tuple[State, State]:
-        """Step all environments; the states after and before finished ones are reset, `[B, …]`."""
-        last = jax.vmap(self._task.step)(state, action)
-        is_over = last.terminated | last.truncated
+    def _read_state(self) -> State | None:
+        return self._state
 
-        def reset_finished(state: State) -> State:
-            return jax.vmap(_select)(is_over, jax.vmap(self._task.reset)(keys), state)
+    def _write_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        refuse_fork()
+        warmstart = None if self._state is None else self._state.physics.qacc_warmstart
+        self._state, _ = self._programs.reset_to(qpos, qvel, warmstart)
 
-        return jax.lax.cond(is_over.any(), reset_finished, lambda state: state, last), last
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: jax.device_get(value) for name, value in vars(self).items() if name not in _NOT_PICKLED}
 
-
-def _select(condition: jax.Array, new: State, old: State) -> State:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
-
-
-def _draw_key(rng: np.random.Generator) -> jax.Array:
-    return jax.random.PRNGKey(int(rng.integers(2**31)))
-
-
-def _spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """Observation and action space of one environment."""
-    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
-    observations = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
-    return observations, gymnasium.spaces.Box(low, high, dtype=np.float32)
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._build()

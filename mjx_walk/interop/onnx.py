@@ -32,16 +32,23 @@ _INLINED = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 _SHAPES_ONLY = ("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "copy", "stop_gradient")
 
 
-def translate(policy: Callable[[jax.Array], jax.Array], observation_size: int, name: str) -> onnx.ModelProto:
+DTYPES = {"float64": TensorProto.DOUBLE, "float32": TensorProto.FLOAT}
+"""ONNX's types of the input, by NumPy's names. A model takes one of them: ONNX does not convert inputs."""
+
+
+def translate(
+    policy: Callable[[jax.Array], jax.Array], observation_size: int, name: str, dtype: str = "float64"
+) -> onnx.ModelProto:
     """Translate a policy to ONNX.
 
     Args:
         policy: `[observation_size] f32 → [action_size] f32`, unbatched.
         observation_size: size of its input.
         name: of the graph.
+        dtype: of the input. Gymnasium's observations are float64.
 
     Returns:
-        A model with the input `observation`, `[N, observation_size] f64`, and the output `action`,
+        A model with the input `observation`, `[N, observation_size]` of that dtype, and the output `action`,
         `[N, action_size] f32`, both in Gymnasium's units.
 
     Raises:
@@ -56,7 +63,7 @@ def translate(policy: Callable[[jax.Array], jax.Array], observation_size: int, n
         helper.make_graph(
             graph.needed_for("action"),
             name,
-            [helper.make_tensor_value_info("observation", TensorProto.DOUBLE, ["N", observation_size])],
+            [helper.make_tensor_value_info("observation", DTYPES[dtype], ["N", observation_size])],
             [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["N", closed.out_avals[0].shape[-1]])],
             graph.initializers,
         ),

@@ -30,7 +30,7 @@ def register() -> None:
             gymnasium.register(
                 f"mjx_walk/{name}-{version}",
                 entry_point="mjx_walk.interop.gymnasium_env:MjxWalkEnv",
-                vector_entry_point="mjx_walk.interop.gymnasium_env:MjxWalkVectorEnv",
+                vector_entry_point="mjx_walk.interop.gymnasium_vector_env:MjxWalkVectorEnv",
                 max_episode_steps=max_episode_steps,
                 kwargs={"env": env, "version": version},
             )

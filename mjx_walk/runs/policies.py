@@ -42,14 +42,27 @@ class SavedPolicy:
         self.reward_function = saved.env.reward_function
         """`PATH.py:FUNCTION` of the training, which is not loaded."""
         self.config = _without_reward_function(saved)
-        engine = physics or _engine_here(self.config.physics)
-        self.task = make_task(dataclasses.replace(self.config, physics=engine))
-        self.algorithm = make_acting_algorithm(self.task, self.config)
+        self._physics = physics
+        self._build()
         state = jax.eval_shape(self.algorithm.init, jax.random.PRNGKey(0))
         like = jax.eval_shape(self.algorithm.policy_params, state)
         self.policy_name = choose_policy(folder, policy)
         """`final` or `best`."""
         self.policy_params, self.policy_facts = load_policy(folder, self.policy_name, like)
+
+    def _build(self) -> None:
+        engine = self._physics or _engine_here(self.config.physics)
+        self.task = make_task(dataclasses.replace(self.config, physics=engine))
+        self.algorithm = make_acting_algorithm(self.task, self.config)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle and copy the parameters, without compiled functions."""
+        kept = {name: value for name, value in vars(self).items() if name not in ("task", "algorithm", "act")}
+        return kept | {"policy_params": jax.device_get(self.policy_params)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._build()
 
     @functools.cached_property
     def act(self) -> Callable:

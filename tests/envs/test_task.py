@@ -1,5 +1,7 @@
 """The contract of a task: purity, vmap, the finiteness check, shapes, and errors for invalid options."""
 
+import copy
+import pickle
 from pathlib import Path
 
 import gymnasium
@@ -166,3 +168,20 @@ def test_loading_models_prints_no_deprecations(tmp_path, monkeypatch, capfd):
     with pytest.warns(UserWarning, match="a warning of another kind"), hide_deprecations():
         mujoco.get_mju_user_warning()("a warning of another kind")
     assert mujoco.get_mju_user_warning() is None
+
+
+@pytest.mark.parametrize("physics", ["c", "jax"])
+def test_a_wrong_action_is_refused_while_the_step_is_traced(physics):
+    env = make_env("walker2d", physics)
+    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    for shape in ((), (1,), (5,), (1, 6)):
+        with pytest.raises(ValueError, match="Action dimension mismatch"):
+            jax.eval_shape(env.step, state, jax.ShapeDtypeStruct(shape, jnp.float32))
+
+
+def test_a_task_can_be_copied_and_pickled():
+    env = make_env("ant", "c", version="v4", use_contact_forces=True)
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    for other in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        assert other.options == env.options and other.engine.name == "c"
+        jax.tree.map(np.testing.assert_array_equal, jax.jit(other.reset)(jax.random.PRNGKey(0)), state)

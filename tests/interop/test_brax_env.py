@@ -3,10 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from brax.envs.wrappers import training
 
 from mjx_walk.envs import make_env
 from mjx_walk.interop.brax_env import BraxEnv
+from mjx_walk.utils.errors import UserError
 
 
 def test_brax_wrappers_drive_it():
@@ -34,3 +36,48 @@ def test_brax_wrappers_drive_it():
     assert fell > 0 and cut > 0
     np.testing.assert_allclose(state.metrics["reward_survive"], 5.0)
     assert jnp.isfinite(state.obs).all()
+
+
+def test_what_braxs_environments_have():
+    env = BraxEnv("humanoid", physics="c")
+    assert env.dt == make_env("humanoid", "c").dt and env.sys.nq == 24
+    np.testing.assert_array_equal(env.sys.actuator.ctrl_range, [[-1.0, 1.0]] * 17)
+    with jax.enable_x64(True):
+        state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+        assert state.done.dtype == jax.jit(env.step)(state, np.zeros(17)).done.dtype == jnp.float32
+    for action in (0.3, np.zeros(16), np.zeros((1, 17))):
+        with pytest.raises(ValueError, match="Action dimension mismatch"):
+            env.step(state, action)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_braxs_wrapper_for_gym_drives_it():
+    pytest.importorskip("gym", reason="pip install gym")
+    gym_wrapper = pytest.importorskip("brax.envs.wrappers.gym").GymWrapper
+    env = gym_wrapper(BraxEnv("walker2d", physics="c"))
+    assert env.reset().shape == (17,) and env.action_space.shape == (6,)
+    obs, reward, _, info = env.step(np.zeros(6, np.float32))
+    assert obs.shape == (17,) and np.isfinite(reward) and "reward_forward" in info
+
+
+def masses_times_half_one_and_two(sys):
+    in_axes = jax.tree.map(lambda _: None, sys).tree_replace({"body_mass": 0})
+    return sys.tree_replace({"body_mass": jnp.outer(jnp.array([0.5, 1.0, 2.0]), sys.body_mass)}), in_axes
+
+
+def test_domain_randomization_needs_an_engine_that_can_change_its_model():
+    env = training.DomainRandomizationVmapWrapper(BraxEnv("walker2d", physics="c"), masses_times_half_one_and_two)
+    with pytest.raises(UserError, match=r"use BraxEnv.*physics='jax'"):
+        env.reset(jax.random.split(jax.random.PRNGKey(0), 3))
+
+
+@pytest.mark.slow
+def test_domain_randomization():
+    """The environment with the model's own masses steps as without the wrapper, the others differ."""
+    env = BraxEnv("walker2d", physics="jax")
+    wrapped = training.DomainRandomizationVmapWrapper(env, masses_times_half_one_and_two)
+    key, action = jax.random.PRNGKey(0), jnp.full(6, 0.5)
+    many = jax.jit(wrapped.step)(jax.jit(wrapped.reset)(jnp.tile(key, (3, 1))), jnp.tile(action, (3, 1)))
+    one = jax.jit(env.step)(jax.jit(env.reset)(key), action)
+    np.testing.assert_allclose(many.obs[1], one.obs, atol=1e-5)
+    assert min(np.abs(many.obs[i] - one.obs).max() for i in (0, 2)) > 0.01

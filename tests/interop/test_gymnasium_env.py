@@ -1,18 +1,20 @@
 """The tasks through Gymnasium's interface."""
 
+import copy
+import pickle
+
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium import wrappers
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import TimeLimit
+from helpers import renders
+from side_by_side import IDS, REGISTERED, assert_same, make_both, outcome
 
-import mjx_walk  # noqa: F401  registers the names
 from mjx_walk.envs import TASKS, make_env
+from mjx_walk.interop import gymnasium_programs
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.quiet_mujoco import hide_deprecations
-
-REGISTERED = [name for name in gymnasium.registry if name.startswith("mjx_walk/")]
-NAMES = [name for name in REGISTERED if name != "mjx_walk/Pusher-v4"]
 
 
 def test_every_task_is_registered():
@@ -32,14 +34,20 @@ def test_what_gymnasium_does_not_support_is_refused(make):
 
 
 @pytest.mark.filterwarnings("ignore")  # about unbounded observations
-@pytest.mark.parametrize("name", NAMES)
-def test_gymnasium_accepts_it(name):
-    env = gymnasium.make(name, physics="c")
-    check_env(env.unwrapped, skip_render_check=True)
-    with hide_deprecations():
-        theirs = gymnasium.make(name.removeprefix("mjx_walk/"))
-    assert env.observation_space.shape == theirs.observation_space.shape
-    np.testing.assert_array_equal(env.action_space.high, theirs.action_space.high)
+@pytest.mark.parametrize("name", IDS)
+def test_every_task_is_gymnasiums(name):
+    """Spaces, starts of a seed, steps, info and four wrappers, on the engine that is MuJoCo's C library."""
+    ours, real = make_both(name)
+    check_env(ours.unwrapped, skip_render_check=True)
+    assert ours.metadata == real.metadata and ours.spec.max_episode_steps == real.spec.max_episode_steps
+    assert ours.unwrapped.model.nq == real.unwrapped.model.nq and ours.unwrapped.dt == real.unwrapped.dt
+    assert_same(outcome(wrapped, ours), outcome(wrapped, real), atol=5e-3)
+
+
+def wrapped(env):
+    """Four wrappers. The time limit ends the episode, with its statistics, in the last step."""
+    env = wrappers.ClipAction(wrappers.RecordEpisodeStatistics(wrappers.TimeLimit(env, 12)))
+    return wrappers.FrameStackObservation(env, 2)
 
 
 def test_steps_are_gymnasiums_own():
@@ -48,8 +56,8 @@ def test_steps_are_gymnasiums_own():
     real = gymnasium.make("Walker2d-v5")
     obs, _ = env.reset(seed=3)
     real.reset()
-    state = env.unwrapped._state.physics
-    real.unwrapped.set_state(np.float64(state.qpos), np.float64(state.qvel))
+    qpos, qvel = np.split(env.unwrapped.state_vector(), 2)
+    real.unwrapped.set_state(qpos, qvel)
     rng = np.random.default_rng(0)
     for _ in range(15):
         action = rng.uniform(-1, 1, 6)
@@ -75,33 +83,6 @@ def test_there_is_one_time_limit():
         gymnasium.make("mjx_walk/Walker2d-v5", physics="c").unwrapped.step(np.zeros(6))
 
 
-@pytest.mark.parametrize("physics", ["c", pytest.param("jax", marks=pytest.mark.slow)])
-def test_many_side_by_side(physics):
-    """Environments that fall or reach the limit reset in the same step. Their last observation is in `final_obs`."""
-    envs = gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=6, physics=physics, max_episode_steps=20)
-    obs, _ = envs.reset(seed=1)
-    again, _ = envs.reset(seed=1)
-    np.testing.assert_array_equal(obs, again)
-    assert len({tuple(row) for row in obs}) == 6 and envs.observation_space.contains(obs)
-    rng = np.random.default_rng(0)
-    healthy_z, fell, cut = (0.8, 2.0), 0, 0
-    ages = np.zeros(6, int)
-    for _ in range(100):
-        obs, reward, terminated, truncated, info = envs.step(rng.uniform(-1, 1, (6, 6)))
-        ages += 1
-        over = terminated | truncated
-        assert reward.shape == (6,) and info["reward_forward"].shape == (6,)
-        assert (ages[over] <= 20).all() and (ages[truncated] == 20).all() and (ages[~over] < 20).all()
-        for i in np.flatnonzero(over):
-            last = info["final_obs"][i]
-            z, angle = last[0], last[1]
-            assert truncated[i] or not (healthy_z[0] < z < healthy_z[1] and abs(angle) < 1.0)
-            assert abs(obs[i, 0] - 1.25) < 0.01 and info["_final_obs"][i]
-        fell, cut = fell + terminated.sum(), cut + truncated.sum()
-        ages[over] = 0
-    assert fell >= 2 and cut >= 2
-
-
 def test_its_keywords_are_gymnasiums():
     env = gymnasium.make("mjx_walk/Humanoid-v5", physics="c", include_cfrc_ext_in_observation=False)
     assert (
@@ -111,18 +92,102 @@ def test_its_keywords_are_gymnasiums():
     assert make_env("humanoid", "c").observation_size == 348 > env.observation_space.shape[0]
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_stable_baselines3_trains_on_it():
-    """PPO of another library, with its defaults: episodes get longer and better, on Gymnasium's own task, too."""
-    stable_baselines3 = pytest.importorskip("stable_baselines3", reason="pip install stable-baselines3")
-    evaluate_policy = stable_baselines3.common.evaluation.evaluate_policy
-    pytest.importorskip("torch").set_num_threads(1)  # several threads wait for each other while another test runs
+def test_a_wrong_action_raises_before_anything_runs():
     env = gymnasium.make("mjx_walk/Walker2d-v5", physics="c")
-    model = stable_baselines3.PPO("MlpPolicy", env, seed=0, device="cpu", verbose=0)
-    real = stable_baselines3.common.monitor.Monitor(gymnasium.make("Walker2d-v5"))
-    before, _ = evaluate_policy(model, real, n_eval_episodes=10)
-    model.learn(30_000)
-    returns = [episode["r"] for episode in model.ep_info_buffer]
-    after, _ = evaluate_policy(model, real, n_eval_episodes=10)
-    assert np.mean(returns) > 100 and after > before + 100
+    env.reset(seed=0)
+    before = env.unwrapped.state_vector()
+    for action in (0.3, np.zeros(1), np.zeros(5), np.zeros((1, 6)), np.zeros((6, 1))):
+        with pytest.raises(ValueError, match=r"Action dimension mismatch. Expected \(6,\), found"):
+            env.step(action)
+    np.testing.assert_array_equal(env.unwrapped.state_vector(), before)
+
+
+def test_copies_and_pickles_go_on_alike():
+    env = gymnasium.make("mjx_walk/Walker2d-v5", physics="c", max_episode_steps=20)
+    env.reset(seed=0)
+    env.step(np.full(6, 0.5))
+    copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    for _ in range(3):
+        expected = env.step(np.full(6, -0.5))
+        for other in copies:
+            assert_same(other.step(np.full(6, -0.5)), expected, atol=0)
+    expected, _ = env.reset()
+    for other in copies:
+        np.testing.assert_array_equal(other.reset()[0], expected)
+        assert other.action_space == env.action_space and other.spec == env.spec
+    assert gymnasium.make(env.spec).spec == env.spec
+
+
+def test_what_it_returns_may_be_written_to():
+    env = gymnasium.make("mjx_walk/Humanoid-v5", physics="c")
+    first, info = env.reset(seed=0)
+    kept = first.copy()
+    first[:] = 0.0
+    info["tendon_length"][:] = 0.0
+    assert env.observation_space.contains(kept)
+    np.testing.assert_array_equal(env.reset(seed=0)[0], kept)
+
+
+def test_attributes_of_mujoco_environments():
+    ours, real = make_both("Walker2d-v5", width=64, height=48)
+    ours, real = ours.unwrapped, real.unwrapped
+    for name in ("dt", "frame_skip", "observation_structure", "width", "height", "camera_id", "camera_name"):
+        assert getattr(ours, name) == getattr(real, name), name
+    np.testing.assert_array_equal(ours.init_qpos, real.init_qpos)
+    np.testing.assert_array_equal(ours.init_qvel, real.init_qvel)
+    qpos = real.init_qpos + 0.125
+    ours.set_state(qpos, real.init_qvel + 0.25)
+    np.testing.assert_array_equal(ours.state_vector(), [*qpos, *(real.init_qvel + 0.25)])
+    real.set_state(qpos, real.init_qvel + 0.25)
+    np.testing.assert_allclose(ours.get_body_com("foot"), real.get_body_com("foot"))
+    assert_same(ours.step(np.full(6, 0.5)), real.step(np.full(6, 0.5)))
+    with pytest.raises(AssertionError):
+        ours.set_state(np.zeros(3), np.zeros(9))
+
+
+def test_info_says_that_the_physics_is_not_finite():
+    """Gymnasium has no such entry, and resets the simulation in silence."""
+    env = gymnasium.make("mjx_walk/HalfCheetah-v5", physics="c").unwrapped
+    env.reset(seed=0)
+    env.set_state(env.init_qpos, np.full(9, 9e9))
+    _, reward, terminated, _, info = env.step(np.zeros(6))
+    assert terminated and reward == 0.0 and info["nonfinite"] == 1.0
+
+
+def test_a_window_needs_a_screen(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(UserError, match="render_mode='human' needs a screen; use render_mode='rgb_array'"):
+        gymnasium.make("mjx_walk/Walker2d-v5", physics="c", render_mode="human")
+
+
+def test_a_changed_model_is_not_ignored():
+    env = gymnasium.make("mjx_walk/Walker2d-v5", physics="c")
+    env.unwrapped.model.geom_rgba[:] = 1.0
+    env.reset()
+    env.unwrapped.model.body_mass[1] *= 2.0
+    with pytest.raises(UserError, match=r"does not read your change of model\.body_mass; use xml_file=PATH"):
+        env.reset()
+
+
+@renders
+@pytest.mark.parametrize("mode", ["rgb_array", "depth_array", "rgbd_tuple", "rgb_array_list"])
+def test_frames_are_gymnasiums(mode):
+    keywords = {"render_mode": mode, "width": 80, "height": 64, "camera_name": "track", "max_geom": 100}
+    frames = []
+    for env in make_both("Walker2d-v5", **keywords):
+        env.reset(seed=0)
+        env.step(np.full(6, 0.5))
+        frames.append(env.render())
+        env.close()
+    assert_same(*frames)
+
+
+def test_a_forked_process_is_told_to_spawn(monkeypatch):
+    """JAX would wait for ever. A forked worker of `AsyncVectorEnv` still gives its spaces."""
+    monkeypatch.setattr(gymnasium_programs, "_process_of_jax", [1])
+    env = gymnasium.make("mjx_walk/Walker2d-v5", physics="c")
+    assert env.observation_space.shape == (17,)
+    with pytest.raises(gymnasium.error.Error, match=r"vector_kwargs={'context': 'spawn'}"):
+        env.reset()

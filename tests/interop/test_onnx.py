@@ -21,9 +21,9 @@ from mjx_walk.runs.policies import deterministic_act
 from mjx_walk.utils.errors import UserError
 
 
-def assert_equal(model, act, observations):
+def assert_equal(model, act, observations, dtype=np.float64):
     session = onnxruntime.InferenceSession(model.SerializeToString())
-    (found,) = session.run(["action"], {"observation": observations})
+    (found,) = session.run(["action"], {"observation": observations.astype(dtype)})
     expected = np.asarray(act(np.float32(observations)))
     assert found.shape == expected.shape and found.dtype == np.float32 and expected.std() > 0.01
     # For the policies in the zoo, float32 alone changes an action by up to 1.5e-5 against float64.
@@ -41,6 +41,7 @@ def test_policies_of_the_zoo(name):
     model = translate(run.act, run.task.observation_size, name)
     assert_equal(model, run.act, observations)
     assert_equal(model, run.act, observations[:1])
+    assert_equal(translate(run.act, run.task.observation_size, name, "float32"), run.act, observations, np.float32)
     num_weights = sum(x.size for x in jax.tree.leaves(run.policy_params))
     assert len(model.SerializeToString()) < 4 * num_weights + 10_000  # each is written once
 

@@ -1,5 +1,8 @@
 """The policies that come with the package."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from helpers import command, command_here
@@ -61,3 +64,11 @@ def test_the_table_and_an_unknown_name(capsys):
     assert zoo.names() == NAMES
     assert command_here("eval", "run=zoo:humanoid-dqn") == 2
     assert "no policy 'humanoid-dqn' in the zoo; choose one of: " in capsys.readouterr().err
+
+
+def test_a_policy_can_be_copied_and_pickled():
+    run = mjx_walk.load_run("zoo:walker2d-sac", "c")
+    obs = np.random.default_rng(0).normal(size=(3, 17))
+    expected = run.policy(obs)
+    for policy in (pickle.loads(pickle.dumps(run.policy)), copy.deepcopy(run).policy):
+        np.testing.assert_array_equal(policy(obs), expected)

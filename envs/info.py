@@ -1,0 +1,68 @@
+"""Gymnasium's `info` dictionaries, as pure functions of states."""
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from mjx_walk.envs.state import State
+from mjx_walk.envs.task_options import TaskOptions
+
+Info = dict[str, Array]
+"""Entries of `info` by name: `[] f32`, or `[n] f32` for tendons."""
+
+
+def plane_position(position: Float[Array, "2"]) -> Info:
+    """Entries of a position in the horizontal plane, x and y in m."""
+    x, y = position
+    return {"x_position": x, "y_position": y, "distance_from_origin": jnp.linalg.norm(position)}
+
+
+def plane_velocity(velocity: Float[Array, "2"]) -> Info:
+    """Entries of a velocity in the horizontal plane, m/s."""
+    x, y = velocity
+    return {"x_velocity": x, "y_velocity": y}
+
+
+class GymnasiumInfo:
+    """The part of a task that gives Gymnasium's `info`. Training does not use it.
+
+    All methods take the states of one environment, of a task with `keep_info`.
+    """
+
+    options: TaskOptions
+    REWARD_TERMS: dict[str, tuple[str, ...]]
+    V4_INFO_HAS_TERMS: bool = True
+    """Whether the `info` of Gymnasium's v4 class holds the reward terms. That of v5 always does."""
+    REWARD_OFFSET: float = 0.0
+    """Constant part of Gymnasium's reward, which no term holds."""
+    reward_terms: tuple[str, ...]
+
+    @property
+    def has_custom_reward(self) -> bool:
+        raise NotImplementedError
+
+    def info_arrays(self) -> tuple[str, ...]:
+        """Names of the `mjData` arrays that `info` holds."""
+        return ()
+
+    def position_info(self, state: State) -> Info:
+        """Entries that depend on one state."""
+        return {}
+
+    def velocity_info(self, before: State, after: State) -> Info:
+        """Entries that depend on the states before and after a step."""
+        return {}
+
+    def reset_info(self, state: State) -> Info:
+        """The `info` of a reset. v4's is empty."""
+        return self.position_info(state) if self.options.version == "v5" else {}
+
+    def step_info(self, before: State, after: State) -> Info:
+        """The `info` of a step. With a custom reward, all terms of that reward are in it."""
+        names = self.REWARD_TERMS[self.options.version]
+        if self.options.version == "v4" and not self.V4_INFO_HAS_TERMS:
+            names = ()
+        if self.has_custom_reward:
+            names = self.reward_terms
+        terms = {name: after.metrics[name] for name in names}
+        return self.position_info(after) | self.velocity_info(before, after) | terms

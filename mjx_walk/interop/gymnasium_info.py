@@ -1,0 +1,52 @@
+"""Gymnasium's `info` dictionaries from arrays: of one environment, and with a mask for each entry of many."""
+
+from typing import Any
+
+import numpy as np
+
+FLAGS = ("nonfinite", "overflow")
+"""Metrics that `info` holds, as 1.0, only where they are set."""
+
+
+def single_info(info: dict[str, Any], metrics: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The `info` of one environment.
+
+    Args:
+        info: numbers, `[]`, or arrays, on the host.
+        metrics: of a step; those of `FLAGS` are added where they are set.
+
+    Returns:
+        NumPy scalars and writable arrays in float64, and integers as `int`.
+    """
+    flags = {name: 1.0 for name in FLAGS if metrics is not None and metrics[name] > 0}
+    return {name: _converted(value) for name, value in info.items()} | flags
+
+
+def _converted(value: Any) -> Any:
+    value = np.asarray(value)
+    if value.ndim:
+        return np.array(value, np.float64)
+    return int(value) if np.issubdtype(value.dtype, np.integer) else np.float64(value)
+
+
+def add_info(target: dict[str, Any], info: dict[str, Any], mask: np.ndarray) -> None:
+    """Add entries of some environments, as Gymnasium's `VectorEnv._add_info` adds those of one.
+
+    Args:
+        target: the `info` of all environments. It gets no entry if the mask is empty.
+        info: `[B, …]` each.
+        mask: which environments have the entries, `[B] bool`.
+    """
+    if not mask.any():
+        return
+    for name, value in info.items():
+        value = np.asarray(value)
+        dtype = np.int64 if np.issubdtype(value.dtype, np.integer) else np.float64
+        target.setdefault(name, np.zeros(value.shape, dtype))[mask] = value[mask]
+        target.setdefault(f"_{name}", np.zeros(mask.shape, np.bool_))[mask] = True
+
+
+def add_flags(target: dict[str, Any], metrics: dict[str, Any], mask: np.ndarray) -> None:
+    """Add the metrics of `FLAGS` for the environments of a mask, `[B] bool`, in which they are set."""
+    for name in FLAGS:
+        add_info(target, {name: metrics[name]}, mask & (np.asarray(metrics[name]) > 0))

@@ -1,0 +1,61 @@
+"""One environment of the vector environment, for code that asks for its attributes."""
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import jax
+import numpy as np
+
+from mjx_walk.envs import State
+from mjx_walk.interop.gymnasium_twin import MujocoAttributes
+
+if TYPE_CHECKING:
+    from mjx_walk.interop.gymnasium_vector_env import MjxWalkVectorEnv
+
+
+class SubEnv(MujocoAttributes):
+    """One environment of `MjxWalkVectorEnv`, as `get_attr`, `set_attr`, `call` and `render` see it."""
+
+    def __init__(self, vector_env: "MjxWalkVectorEnv", index: int):
+        self._vector_env, self._index = vector_env, index
+
+    @property
+    def _twin(self):  # type: ignore[override]
+        return self._vector_env._twin
+
+    @property
+    def render_mode(self) -> str | None:  # type: ignore[override]
+        return self._vector_env.render_mode
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """Gymnasium's for one environment."""
+        return {name: value for name, value in self._vector_env.metadata.items() if name != "autoreset_mode"}
+
+    @property
+    def spec(self) -> Any:
+        return self._vector_env.spec
+
+    @property
+    def observation_space(self) -> gymnasium.Space:
+        return self._vector_env.single_observation_space
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        return self._vector_env.single_action_space
+
+    @property
+    def np_random_seed(self) -> int | None:
+        seeds = self._vector_env.np_random_seed
+        return seeds[self._index] if seeds else None
+
+    def _read_state(self) -> State | None:
+        return jax.tree.map(lambda x: x[self._index], self._vector_env._state)
+
+    def _write_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        env, i = self._vector_env, self._index
+        if env._state is None:
+            raise gymnasium.error.ResetNeeded("call reset before set_state")
+        new, _ = env._programs.reset_to(qpos, qvel, env._state.physics.qacc_warmstart[i])
+        new = new.replace(steps=env._state.steps[i])
+        env._state = jax.tree.map(lambda x, y: x.at[i].set(y), env._state, new)

@@ -1,0 +1,239 @@
+"""Many environments in one compiled program: `gymnasium.make_vec("mjx_walk/Humanoid-v5", num_envs=4096)`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from mjx_walk.envs import State, make_options
+from mjx_walk.envs.state import check_action_shape
+from mjx_walk.interop.gymnasium_info import add_flags, add_info
+from mjx_walk.interop.gymnasium_programs import make_programs, refuse_fork
+from mjx_walk.interop.gymnasium_sub_env import SubEnv
+from mjx_walk.interop.gymnasium_twin import RENDER_MODES, make_twin, physics_values, refuse_changes, split_keywords
+from mjx_walk.utils.errors import UserError
+
+_NOT_PICKLED = ("_twin", "_original", "_programs", "envs")
+
+
+class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
+    """B environments that behave as in Gymnasium's `SyncVectorEnv`, with the same modes of automatic resets.
+
+    Resets are drawn on the device: a seed determines an environment's episodes, but gives other starts than Gymnasium.
+    Copies and pickles keep the states and random generators.
+    """
+
+    metadata = {"render_modes": list(RENDER_MODES), "autoreset_mode": AutoresetMode.NEXT_STEP}
+
+    def __init__(
+        self,
+        num_envs: int,
+        env: str,
+        physics: str = "auto",
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        **keywords: Any,
+    ):
+        """
+        Args:
+            num_envs: number of environments, B.
+            env: name of the task.
+            physics: engine.
+            autoreset_mode: as in `SyncVectorEnv`, finished environments reset in the next step, in the same step, or
+                only when `reset` is called.
+            keywords: Gymnasium's, and those of `TaskOptions`.
+
+        Raises:
+            UserError: an unknown name, engine or keyword, or `render_mode="human"`.
+        """
+        refuse_fork()
+        options, self._rendering = split_keywords(keywords)
+        if self._rendering.get("render_mode") == "human":
+            raise UserError(
+                "render_mode='human' shows one environment: use gymnasium.make or vectorization_mode='sync'"
+            )
+        self._options, self._physics = make_options(env, **options), physics
+        self.num_envs = num_envs
+        self._state: State | None = None
+        self._keys: np.ndarray | jax.Array | None = None
+        self._seeds: tuple[int, ...] = ()
+        self._is_over = np.zeros(num_envs, np.bool_)
+        self._build()
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        fps = round(1.0 / self._twin.dt)
+        self.metadata = self._twin.metadata | {"render_fps": fps, "autoreset_mode": self.autoreset_mode}
+        self.render_mode = self._twin.render_mode
+        self.single_observation_space = self._twin.observation_space
+        self.single_action_space = self._twin.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def _build(self) -> None:
+        self._programs = make_programs(self._options, self._physics)
+        self._twin = make_twin(self._options, self._rendering)
+        self._original = physics_values(self._twin.model)
+        self.envs = [SubEnv(self, i) for i in range(self.num_envs)]
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """The seed of each environment; empty before the first reset."""
+        return self._seeds
+
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None):
+        """Start episodes in all environments, or in those of `options["reset_mask"]`, `[B] bool`.
+
+        Args:
+            seed: one for each environment, or an int, to which environment i adds i. Without a seed, an environment
+                continues its sequence of random numbers.
+            options: as in `SyncVectorEnv`.
+        """
+        refuse_changes(self._twin.model, self._original)
+        seeds = self._listed_seeds(seed)
+        mask = _checked_mask(options["reset_mask"], self.num_envs) if options and "reset_mask" in options else None
+        if mask is not None and self._state is None:
+            raise gymnasium.error.ResetNeeded("reset all environments before you reset some with reset_mask")
+        self._seed(seeds, np.ones(self.num_envs, np.bool_) if mask is None else mask)
+        mask, before = (np.ones(self.num_envs, np.bool_), None) if mask is None else (mask, self._state)
+        self._state, self._keys, reset_info = self._programs.reset_many(before, self._keys, mask)
+        self._is_over = self._is_over & ~mask
+        info: dict[str, Any] = {}
+        add_info(info, jax.device_get(reset_info), mask)
+        return np.array(self._state.obs, np.float64), info
+
+    def step(self, actions):
+        """Step all environments.
+
+        Args:
+            actions: `[B, action_size]`, in Gymnasium's units.
+
+        Raises:
+            ValueError: the actions have another shape.
+        """
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
+        check_action_shape(actions, (self.num_envs, self._twin.model.nu))
+        mode, was_over = self.autoreset_mode, self._is_over
+        if mode == AutoresetMode.DISABLED:
+            assert not was_over.any(), f"reset the finished environments first: {np.flatnonzero(was_over)}"
+        self._state, last, self._keys, *infos = self._programs.step_many(
+            self._state, np.asarray(actions, np.float32), self._keys, was_over, mode=mode
+        )
+        returned = self._state if mode == AutoresetMode.NEXT_STEP else last
+        obs, outcome, metrics, infos = jax.device_get(
+            (self._state.obs, (returned.terminated, returned.truncated), last.metrics, infos)
+        )
+        terminated, truncated = (np.array(flags) for flags in outcome)
+        self._is_over = terminated | truncated
+        reward = self._programs.reward(last.replace(metrics=metrics))
+        info: dict[str, Any] = {}
+        if mode == AutoresetMode.NEXT_STEP:
+            reward = np.where(was_over, 0.0, reward)
+            self._add_infos(info, infos, metrics, ~was_over)
+        else:
+            is_reset = self._is_over if mode == AutoresetMode.SAME_STEP else np.zeros_like(self._is_over)
+            if is_reset.any():
+                self._add_final(info, np.asarray(last.obs), infos[0], metrics, is_reset)
+            self._add_infos(info, infos, metrics, ~is_reset)
+        return np.array(obs, np.float64), reward, terminated, truncated, info
+
+    def _add_infos(self, info: dict[str, Any], infos: list, metrics: dict[str, Any], stepped: np.ndarray) -> None:
+        """Add the `info` of the step where an environment stepped, and that of the reset elsewhere."""
+        step_info, reset_info = infos
+        add_info(info, step_info, stepped)
+        add_flags(info, metrics, stepped)
+        add_info(info, reset_info, ~stepped)
+
+    def _add_final(
+        self, info: dict[str, Any], last_obs: np.ndarray, step_info: dict, metrics: dict, is_over: np.ndarray
+    ) -> None:
+        """Add `final_obs`, an object array, and `final_info` of the episodes that end in this step."""
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(is_over):
+            final_obs[i] = np.array(last_obs[i], np.float64)
+        final_info: dict[str, Any] = {}
+        add_info(final_info, step_info, is_over)
+        add_flags(final_info, metrics, is_over)
+        info |= {"final_obs": final_obs, "_final_obs": is_over.copy()}
+        info |= {"final_info": final_info, "_final_info": is_over.copy()}
+
+    def render(self) -> tuple[Any, ...] | None:
+        """A frame of each environment."""
+        return tuple(env.render() for env in self.envs)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Results of a method of each environment, or values of an attribute; see `SubEnv`."""
+        found = [getattr(env, name) for env in self.envs]
+        return tuple(value(*args, **kwargs) if callable(value) else value for value in found)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Values of an attribute of each environment."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of each environment, from a list or tuple of B values or from one value.
+
+        Raises:
+            ValueError: a list or tuple of another length.
+        """
+        listed = values if isinstance(values, (list, tuple)) else [values] * self.num_envs
+        if len(listed) != self.num_envs:
+            raise ValueError(f"got {len(listed)} values for {self.num_envs} environments")
+        for env, value in zip(self.envs, listed, strict=True):
+            setattr(env, name, value)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the OpenGL contexts."""
+        self.envs[0]._close_twin()
+
+    def _listed_seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int):
+            return [seed + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"seeds in a list must be num_envs={self.num_envs} in number, got {len(seed)}")
+        return list(seed)
+
+    def _seed(self, seeds: list[int | None], mask: np.ndarray) -> None:
+        """Give the environments of a mask that have a new seed the key that follows from it, `[2] u32`."""
+        if self._keys is None:
+            drawn = self.np_random.integers(2**31, size=self.num_envs).tolist()
+            seeds = [draw if seed is None else seed for seed, draw in zip(seeds, drawn, strict=True)]
+            self._keys, self._seeds = np.zeros((self.num_envs, 2), np.uint32), tuple(drawn)
+        elif all(seed is None for seed in seeds):
+            return
+        keys, known = np.array(self._keys), list(self._seeds)
+        for i in np.flatnonzero(mask):
+            if seeds[i] is not None:
+                rng, known[i] = seeding.np_random(seeds[i])
+                keys[i] = rng.integers(2**32, size=2, dtype=np.uint32)
+        self._keys, self._seeds = keys, tuple(known)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: jax.device_get(value) for name, value in vars(self).items() if name not in _NOT_PICKLED}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._build()
+
+
+def _checked_mask(mask: Any, num_envs: int) -> np.ndarray:
+    """Check a `reset_mask` as `SyncVectorEnv` does.
+
+    Raises:
+        TypeError: the mask is not an array of bools.
+        ValueError: its shape is not `[num_envs]`, or it selects no environment.
+    """
+    if not isinstance(mask, np.ndarray):
+        raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")
+    if mask.shape != (num_envs,):
+        raise ValueError(f"`options['reset_mask']` must have shape `({num_envs},)`, got {mask.shape}")
+    if mask.dtype != np.bool_:
+        raise TypeError(f"`options['reset_mask']` must have `dtype=np.bool_`, got {mask.dtype}")
+    if not mask.any():
+        raise ValueError("`options['reset_mask']` must select at least one environment")
+    return mask

@@ -1,0 +1,151 @@
+"""Many environments in one program, compared with Gymnasium's `SyncVectorEnv`."""
+
+import copy
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from helpers import renders
+from side_by_side import assert_same, make_both
+
+from mjx_walk.utils.errors import UserError
+
+
+@pytest.mark.parametrize("physics", ["c", pytest.param("jax", marks=pytest.mark.slow)])
+def test_many_side_by_side(physics):
+    """Environments that fall or reach the limit reset in the same step. Their last observation is in `final_obs`."""
+    envs = gymnasium.make_vec(
+        "mjx_walk/Walker2d-v5", num_envs=6, physics=physics, max_episode_steps=20, autoreset_mode="SameStep"
+    )
+    obs, _ = envs.reset(seed=1)
+    again, _ = envs.reset(seed=1)
+    np.testing.assert_array_equal(obs, again)
+    assert len({tuple(row) for row in obs}) == 6 and envs.observation_space.contains(obs)
+    rng = np.random.default_rng(0)
+    healthy_z, fell, cut = (0.8, 2.0), 0, 0
+    ages = np.zeros(6, int)
+    for _ in range(100):
+        obs, reward, terminated, truncated, info = envs.step(rng.uniform(-1, 1, (6, 6)))
+        ages += 1
+        over = terminated | truncated
+        assert reward.shape == (6,) and info["reward_forward"].shape == (6,)
+        assert (ages[over] <= 20).all() and (ages[truncated] == 20).all() and (ages[~over] < 20).all()
+        for i in np.flatnonzero(over):
+            last = info["final_obs"][i]
+            z, angle = last[0], last[1]
+            assert truncated[i] or not (healthy_z[0] < z < healthy_z[1] and abs(angle) < 1.0)
+            assert abs(obs[i, 0] - 1.25) < 0.01 and info["_final_obs"][i]
+        fell, cut = fell + terminated.sum(), cut + truncated.sum()
+        ages[over] = 0
+    assert fell >= 2 and cut >= 2
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+@pytest.mark.parametrize("name", ["Walker2d-v5", "Humanoid-v4"])
+def test_every_mode_of_resets_is_gymnasiums(name, mode):
+    """Through falls and time limits: observations, rewards, flags, info with its masks, and final observations."""
+    keywords = {"num_envs": 3, "max_episode_steps": 25, "reset_noise_scale": 0.0}
+    own = {"autoreset_mode": mode}
+    ours, real = make_both(name, gymnasium.make_vec, own, {"vector_kwargs": own}, **keywords)
+    assert ours.metadata == real.metadata and ours.observation_space == real.observation_space
+    assert_same(ours.reset(seed=[1, 2, 3]), real.reset(seed=[1, 2, 3]))
+    rng, terminated, truncated = np.random.default_rng(0), 0, 0
+    for _ in range(60):
+        action = rng.uniform(-1, 1, ours.action_space.shape) * ours.action_space.high
+        found, expected = ours.step(action), real.step(action)
+        assert_same(found, expected, atol=0.05)
+        terminated, truncated = terminated + found[2].sum(), truncated + found[3].sum()
+        is_over = found[2] | found[3]
+        if mode == AutoresetMode.DISABLED and is_over.any():
+            with pytest.raises(AssertionError):  # Gymnasium's raises it too, but first steps some environments
+                ours.step(action)
+            masks = [{"reset_mask": is_over.copy()} for _ in range(2)]
+            assert_same(ours.reset(options=masks[0]), real.reset(options=masks[1]), atol=0.05)
+    assert terminated and truncated
+
+
+def test_an_environment_depends_on_its_own_seed():
+    envs = gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=3, physics="c")
+    first, _ = envs.reset(seed=[7, 8, 9])
+    assert envs.np_random_seed == (7, 8, 9)
+    np.testing.assert_array_equal(envs.reset(seed=[9, 7, None])[0][:2], first[[2, 0]])
+    np.testing.assert_array_equal(envs.reset(seed=7)[0], first)
+    for seeds in ([1, 2], [1, 2, 3, 4]):
+        with pytest.raises(ValueError, match="num_envs=3"):
+            envs.reset(seed=seeds)
+    mask = np.array([False, True, False])
+    obs, info = envs.reset(seed=[1, 7, 1], options={"reset_mask": mask})
+    np.testing.assert_array_equal(obs, first[[0, 0, 2]])
+    np.testing.assert_array_equal(info["_x_position"], mask)
+    for wrong, error in (([True] * 3, TypeError), (np.ones(2, bool), ValueError), (np.zeros(3, bool), ValueError)):
+        with pytest.raises(error, match="reset_mask"):
+            envs.reset(options={"reset_mask": wrong})
+
+
+def test_wrong_actions_and_keywords_raise():
+    envs = gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=2, physics="c")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.step(np.zeros((2, 6)))
+    envs.reset()
+    for action in (0.0, np.zeros(2), np.zeros((2, 1)), np.zeros((1, 6)), np.zeros(12)):
+        with pytest.raises(ValueError, match="Action dimension mismatch"):
+            envs.step(action)
+    with pytest.raises(UserError, match="'human' shows one environment"):
+        gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=2, render_mode="human")
+
+
+def test_copies_and_attributes():
+    envs = gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=2, physics="c")
+    envs.reset(seed=0)
+    action = np.full((2, 6), 0.5)
+    _, reward, terminated, *_ = envs.step(action)
+    reward[~terminated] -= 1.0  # every array is the caller's
+    copies = [copy.deepcopy(envs), pickle.loads(pickle.dumps(envs))]
+    expected = envs.step(action)
+    for other in copies:
+        assert_same(other.step(action), expected, atol=0)
+    assert envs.get_attr("dt") == (0.008, 0.008) and envs.call("get_body_com", "foot")[1].shape == (3,)
+    envs.set_attr("note", ["a", "b"])
+    assert envs.get_attr("note") == ("a", "b")
+    with pytest.raises(ValueError, match="3 values for 2 environments"):
+        envs.set_attr("note", [1, 2, 3])
+    before = envs.call("state_vector")
+    envs.envs[1].set_state(*np.split(before[0] + 0.5, 2))
+    np.testing.assert_array_equal(envs.call("state_vector"), np.float32([before[0], before[0] + 0.5]))
+
+
+def test_entries_have_the_dtypes_of_gymnasium():
+    """Among them an integer: the reward of a pendulum."""
+    ours, real = make_both("InvertedPendulum-v5", gymnasium.make_vec, num_envs=2, reset_noise_scale=0.0)
+    for env in (ours, real):
+        env.reset()
+    found, expected = (env.step(np.zeros((2, 1))) for env in (ours, real))
+    assert_same(found, expected)
+    assert found[4]["reward_survive"].dtype == expected[4]["reward_survive"].dtype == np.int64
+
+
+@renders
+def test_frames():
+    envs = gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=2, render_mode="rgb_array", width=64, height=48)
+    envs.reset(seed=0)
+    first, second = envs.render()
+    assert first.shape == (48, 64, 3) and first.std() > 0 and (first != second).any()
+    envs.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("context", ["spawn", "forkserver", None])
+def test_workers(context):
+    """Forked ones, the default on Linux before Python 3.14, cannot use JAX and say so."""
+    keywords = {} if context is None else {"vector_kwargs": {"context": context}}
+    envs = gymnasium.make_vec("mjx_walk/Walker2d-v5", 2, vectorization_mode="async", physics="c", **keywords)
+    if context is None:
+        with pytest.raises(gymnasium.error.Error, match=r"vector_kwargs={'context': 'spawn'}"):
+            envs.reset()
+        return
+    obs, _ = envs.reset(seed=3)
+    expected, _ = gymnasium.make("Walker2d-v5").reset(seed=3)
+    np.testing.assert_allclose(obs[0], expected, atol=1e-6)
+    envs.close()
