@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
@@ -46,6 +47,7 @@ class Hopper(Task):
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_forward", "reward_ctrl", "reward_survive"))
     HAS_Y = False
     HEIGHT_INDEX = 1
+    MODEL_NEEDS = ModelNeeds(positions=3)
 
     options: HopperOptions
 

@@ -7,6 +7,7 @@ import mujoco
 from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.task import Task
@@ -41,6 +42,7 @@ class HumanoidBody(Task):
     )
 
     HEIGHT_INDEX = 2
+    MODEL_NEEDS = ModelNeeds(positions=3)
 
     options: HumanoidBodyOptions
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
@@ -38,6 +39,7 @@ class InvertedPendulum(Task):
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_survive",))
     V5_ONLY = (*Task.V5_ONLY, "reset_noise_scale")
     HAS_Y = False
+    MODEL_NEEDS = ModelNeeds(positions=2)
     VIEW = View(body=2, center=(0.0, 0.0, 0.2), distance=2.5)
 
     options: InvertedPendulumOptions

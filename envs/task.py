@@ -1,7 +1,7 @@
 """What all Gymnasium tasks share: model, engine, resets, finiteness check, time limit."""
 
 import abc
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,35 +9,23 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-from mjx_walk.envs.models import body_id, load_model, motor_dofs
+from mjx_walk.envs.models import ModelNeeds, body_id, check_model, is_coordinate, load_model, motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_files import load_reward_function
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, shaping_terms, term_names
 from mjx_walk.envs.state import Carry, State, TrainableTask
 from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.view import View
 from mjx_walk.utils.errors import UserError
+
+__all__ = ["MAX_ABS_VALUE", "Task", "View"]
 
 MAX_ABS_VALUE = 1e10
 """Largest valid position or velocity, as in MuJoCo's own check (`mjMAXVAL`)."""
 
 _NOT_IN_GYMNASIUM = ("name", "version", "max_episode_steps", "shaping", "reward_function")
 """Fields of `TaskOptions` that the constructors of Gymnasium's classes do not take."""
-
-
-class View(NamedTuple):
-    """What films, pages and gait sheets show of a task."""
-
-    body: int = 1
-    """Body whose height and speed they show. In Gymnasium's models, body 1 is the root, and the world is body 0."""
-    center: tuple[float, float, float] | None = None
-    """Point that the camera looks at, m. Default: the camera follows the body."""
-    distance: float = 4.0
-    """From the camera to its center, m."""
-    elevation: float = -8.0
-    """Angle of the line of sight above the horizon, degrees; -90 looks straight down."""
-    azimuth: float = 90.0
-    """Direction of the line of sight, degrees; 0 looks along x, 90 along y."""
 
 
 class Task(TrainableTask, abc.ABC):
@@ -58,6 +46,8 @@ class Task(TrainableTask, abc.ABC):
     """Env options that Gymnasium's v5 class does not take."""
     MISSING_VERSIONS: dict[str, str] = {}
     """Why a version is not available, by version."""
+    MODEL_NEEDS: ModelNeeds = ModelNeeds()
+    """What the task reads of a model by index."""
     HAS_X: bool = True
     """Whether `qpos[0]` is the root's forward coordinate x."""
     HAS_Y: bool = True
@@ -65,6 +55,7 @@ class Task(TrainableTask, abc.ABC):
     HEIGHT_INDEX: int | None = None
     """Index of the root's height in `qpos`. None: the root cannot leave the ground."""
     VIEW: View = View()
+    """What films show of the task's own model. `view` is for the model of `xml_file`."""
 
     def __init__(self, options: TaskOptions, physics: str = "auto"):
         """
@@ -74,18 +65,21 @@ class Task(TrainableTask, abc.ABC):
 
         Raises:
             UserError: an unknown version or engine, an option that the version does not take, shaping that has no
-                effect, a model file or reward function that is missing or invalid, or a body that the model lacks.
+                effect, a model file or reward function that is missing or invalid, or a model that lacks what the task
+                reads or has what the engine does not simulate.
         """
         _check_version(self, options)
         self.options = options
         self.max_episode_steps = options.max_episode_steps
         self.model = load_model(options.xml_file or self.XML_FILES[options.version])
+        self.body_ids = {body: body_id(self.model, body) for body in self.named_bodies()}
+        check_model(self.model, options.name, self.MODEL_NEEDS)
+        self.view = self.VIEW._replace(body=min(self.VIEW.body, self.model.nbody - 1))
         self.dt = self.model.opt.timestep * options.frame_skip
         self.engine = make_engine(resolve_engine(physics), self.model, options.frame_skip, self.derived_names())
         low, high = self.model.actuator_ctrlrange.T
         self.action_low, self.action_high = jnp.float32(low), jnp.float32(high)
         self.action_size = self.model.nu
-        self.body_ids = {body: body_id(self.model, body) for body in self.named_bodies()}
         self.init_qpos = jnp.asarray(self.model.qpos0, jnp.float32)
         self.init_qvel = jnp.zeros(self.model.nv, jnp.float32)
         self.observation_size = sum(self.observation_blocks().values())
@@ -97,10 +91,12 @@ class Task(TrainableTask, abc.ABC):
 
     def _check_shaping(self) -> None:
         name, shaping = self.options.name, self.options.shaping
-        if shaping.backward and not self.HAS_X:
+        if shaping.backward and not (self.HAS_X and is_coordinate(self.model, 0, axis=0)):
             raise UserError(f"env.shaping.backward={shaping.backward}: {name} has no x coordinate; set it to 0")
-        if shaping.keep_y and not self.HAS_Y:
+        if shaping.keep_y and not (self.HAS_Y and is_coordinate(self.model, 1, axis=1)):
             raise UserError(f"env.shaping.keep_y={shaping.keep_y}: {name} has no y coordinate; set it to 0")
+        if shaping.shaking and not self._motor_dofs.size:
+            raise UserError(f"env.shaping.shaking={shaping.shaking}: no motor drives a joint; set it to 0")
         if shaping.falling and not self.terminates_on_fall:
             raise UserError(f"env.shaping.falling={shaping.falling}: no fall terminates this {name}; set it to 0")
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
@@ -44,6 +45,7 @@ class Walker2d(Task):
     XML_FILES = {"v5": "walker2d_v5.xml", "v4": "walker2d.xml"}
     HAS_Y = False
     HEIGHT_INDEX = 1
+    MODEL_NEEDS = ModelNeeds(positions=3)
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_forward", "reward_ctrl", "reward_survive"))
 
     options: Walker2dOptions

@@ -10,9 +10,12 @@ from mjx_walk.envs.physics.base import Derived
 MIN_SOLVER_ITERATIONS = 8
 """Newton iterations and line-search steps. In float32, 8 give the same result as 50; 4 do only with few contacts."""
 
+_CONTACT_LIMITS = ("max_contact_points", "max_geom_pairs")
+"""Custom numbers by which MJX leaves out contacts. MuJoCo does not know them."""
+
 
 def with_newton_solver(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Copy of a model that uses the Newton solver, with enough iterations to converge.
+    """Copy of a model that uses the Newton solver, with enough iterations to converge, and all contacts.
 
     Deviation: Gymnasium's humanoids use PGS, which MJX does not implement. The constraint problem is convex and has one
     solution. After convergence, the two solvers agree to 1e-6.
@@ -21,6 +24,10 @@ def with_newton_solver(model: mujoco.MjModel) -> mujoco.MjModel:
     model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     model.opt.iterations = MIN_SOLVER_ITERATIONS
     model.opt.ls_iterations = MIN_SOLVER_ITERATIONS
+    for name in _CONTACT_LIMITS:
+        limit = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+        if limit >= 0:
+            model.numeric_data[limit] = -1
     return model
 
 

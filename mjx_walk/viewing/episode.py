@@ -92,7 +92,7 @@ def record_episode(
         obs, reward, terminated, truncated, info = env.step(policy(obs))
         is_over = terminated or truncated
         kept["qpos"].append(data.qpos.copy())
-        kept["body"].append(data.xpos[task.VIEW.body].copy())
+        kept["body"].append(data.xpos[task.view.body].copy())
         kept["motor_forces"].append(data.actuator_force * model.actuator_gear[:, 0])
         kept["floor_contacts"].append(_floor_contacts(model, data))
         kept["rewards"].append(float(reward))
@@ -106,7 +106,7 @@ def record_episode(
         env=task.gymnasium_id,
         model=model,
         seconds_per_step=inner.dt,
-        view=task.VIEW,
+        view=task.view,
         reward_terms={name: np.array(values) for name, values in terms.items()},
         frames=frames,
         steps_per_frame=steps_per_frame,
@@ -140,7 +140,7 @@ def _make_rendered(task: Task, width: int, height: int) -> gymnasium.Env:
     env = make_gymnasium(task, render_mode="rgb_array", width=width, height=height)
     inner: Any = env.unwrapped
     model = inner.model
-    inner.mujoco_renderer.default_cam_config = camera_settings(task.VIEW)
+    inner.mujoco_renderer.default_cam_config = camera_settings(task.view)
     inner.mujoco_renderer.camera_id = None  # a camera id would stop the camera from following
     is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     model.geom_size[is_plane, :2] *= _FLOOR_SCALE

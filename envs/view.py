@@ -1,0 +1,18 @@
+"""What films, pages and gait sheets show of a task."""
+
+from typing import NamedTuple
+
+
+class View(NamedTuple):
+    """What films, pages and gait sheets show of a task."""
+
+    body: int = 1
+    """Body whose height and speed they show. In Gymnasium's models, body 1 is the root, and the world is body 0."""
+    center: tuple[float, float, float] | None = None
+    """Point that the camera looks at, m. Default: the camera follows the body."""
+    distance: float = 4.0
+    """From the camera to its center, m."""
+    elevation: float = -8.0
+    """Angle of the line of sight above the horizon, degrees; -90 looks straight down."""
+    azimuth: float = 90.0
+    """Direction of the line of sight, degrees; 0 looks along x, 90 along y."""
