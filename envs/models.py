@@ -1,5 +1,6 @@
 """MuJoCo models: where `xml_file` finds one, loading it, and looking up its parts."""
 
+import logging
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +11,8 @@ from jaxtyping import Int
 
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.quiet_mujoco import hide_deprecations
+
+_LOGGER = logging.getLogger(__name__)
 
 
 class ModelNeeds(NamedTuple):
@@ -91,6 +94,22 @@ def check_model(model: mujoco.MjModel, task: str, needs: ModelNeeds) -> None:
     for i in np.flatnonzero(~(np.isfinite(low) & np.isfinite(high) & (low < high))):
         motor = model.actuator(int(i)).name or int(i)
         raise UserError(f"motor '{motor}' of the model has no range of controls; give it ctrlrange=\"LOW HIGH\"")
+
+
+def warn_of_coordinates(model: mujoco.MjModel, task: str, has_x: bool, height: int | None) -> None:
+    """Log a warning if a task reads other coordinates of a model as x and as the height, as Gymnasium does.
+
+    Args:
+        model: the model.
+        task: name of the task.
+        has_x: whether the task reads `qpos[0]` as x.
+        height: index in `qpos` that the task reads as the height, if it reads one.
+    """
+    read = [(0, 0, "x")] if has_x else []
+    read += [(height, 2, "height")] if height is not None else []
+    for index, axis, name in read:
+        if not is_coordinate(model, index, axis):
+            _LOGGER.warning("qpos[%d] of this model is not the %s, but %s reads it so, as Gymnasium", index, name, task)
 
 
 def is_coordinate(model: mujoco.MjModel, index: int, axis: int) -> bool:

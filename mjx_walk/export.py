@@ -5,6 +5,7 @@ from pathlib import Path
 
 from mjx_walk import zoo
 from mjx_walk.api import load_run
+from mjx_walk.runs.own_tasks import take_task
 from mjx_walk.runs.scores import BEST, POLICIES
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
@@ -31,7 +32,7 @@ class Arguments:
 
 def main(command_line: list[str]) -> None:
     """Write the file."""
-    arguments = cli.parse(Arguments, command_line, USAGE)
+    arguments = cli.parse(Arguments, take_task(command_line), USAGE)
     cli.stay_on_cpu()
     folder = zoo.open_run(arguments.run)
     try:

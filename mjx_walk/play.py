@@ -7,6 +7,7 @@ import imageio.v3 as iio
 
 from mjx_walk import zoo
 from mjx_walk.api import load_run
+from mjx_walk.runs.own_tasks import take_task
 from mjx_walk.runs.scores import BEST, POLICIES
 from mjx_walk.utils import cli
 from mjx_walk.utils.files import replacing
@@ -50,7 +51,7 @@ class Arguments:
 
 def main(command_line: list[str]) -> None:
     """Play an episode, and write the files that the arguments name."""
-    arguments = cli.parse(Arguments, command_line, USAGE)
+    arguments = cli.parse(Arguments, take_task(command_line), USAGE)
     cli.stay_on_cpu()
     folder = zoo.open_run(arguments.run)
     if arguments.html:

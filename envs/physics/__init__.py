@@ -72,6 +72,8 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
         return CEngine(model, num_substeps, derived)
     try:
         return _make_mjx_engine(name, model, num_substeps, derived)
+    except UserError:
+        raise
     except (NotImplementedError, ValueError) as error:
         raise unsupported_by_mjx(name, error) from error
 

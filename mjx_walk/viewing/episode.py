@@ -13,6 +13,7 @@ import numpy as np
 from mjx_walk.envs import Task, View
 from mjx_walk.utils.quiet_mujoco import hide_deprecations
 from mjx_walk.viewing.rendering import choose_opengl
+from mjx_walk.viewing.task_env import TaskEnv
 
 _FLOOR_SCALE = 20.0
 """MuJoCo draws a plane only as large as its `size`; a fast runner leaves it after 3 seconds."""
@@ -67,7 +68,7 @@ def record_episode(
     size: tuple[int, int] | None = None,
     frame_rate: float = 30.0,
 ) -> Episode:
-    """Play one episode in `gymnasium.make`.
+    """Play one episode in the real Gymnasium, or in the task's own engine if Gymnasium has no equal.
 
     Args:
         task: the environment and its keywords.
@@ -115,7 +116,12 @@ def record_episode(
 
 
 def make_gymnasium(task: Task, **keywords: Any) -> gymnasium.Env:
-    """Make the real Gymnasium environment of a task, with further keywords of `gymnasium.make`."""
+    """Make the real Gymnasium environment of a task, with further keywords of `gymnasium.make`.
+
+    A task without an equal in Gymnasium runs in its own engine.
+    """
+    if not task.is_in_gymnasium:
+        return TaskEnv(task, **keywords)
     options = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
     with hide_deprecations(), warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
