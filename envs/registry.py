@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import sys
 import typing
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from mjx_walk.utils.settings import with_name
 __all__ = [
     "BUILT_IN_TASKS",
     "TASKS",
+    "identity",
     "is_registered_from",
     "register_task",
     "register_task_file",
@@ -74,8 +76,8 @@ def register_task(name: str, task: type[Task], options: type[TaskOptions] | None
     if name in BUILT_IN_TASKS:
         raise UserError(f"'{name}' is a task of this package; choose another name")
     _check_task(name, task)
-    if name in TASKS and _identity(TASKS[name][0]) != _identity(task):
-        raise UserError(f"a task '{name}' is registered already, from {_identity(TASKS[name][0])}; choose another name")
+    if name in TASKS and identity(TASKS[name][0]) != identity(task):
+        raise UserError(f"a task '{name}' is registered already, from {identity(TASKS[name][0])}; choose another name")
     options = options or typing.get_type_hints(task).get("options", TaskOptions)
     _check_options(name, options)
     TASKS[name] = (task, with_name(options, name))
@@ -125,8 +127,10 @@ def task_name(task: Any) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", getattr(task, "__name__", str(task))).lower()
 
 
-def _identity(task: type) -> str:
-    return f"{task.__module__}.{task.__qualname__}"
+def identity(kind: type) -> str:
+    """The file, or without one the module, and the name of a class. It stays the same when the file runs again."""
+    module = sys.modules.get(kind.__module__)
+    return f"{getattr(module, '__file__', None) or kind.__module__}:{kind.__qualname__}"
 
 
 def _check_task(name: str, task: Any) -> None:

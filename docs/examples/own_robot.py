@@ -4,19 +4,16 @@ Needs only the model files: pip install --no-deps dm_control
 """
 
 import dataclasses
-import importlib.util
 from pathlib import Path
 
+import dm_control
 import jax.numpy as jnp
 
 import mjx_walk
 from mjx_walk.envs import Task, TaskOptions, View
 from mjx_walk.envs.resets import with_uniform_noise
 
-DM_CONTROL = importlib.util.find_spec("dm_control")
-MODEL = (
-    Path(DM_CONTROL.submodule_search_locations[0]) / "suite/walker.xml" if DM_CONTROL else Path("missing/walker.xml")
-)
+MODEL = Path(dm_control.__path__[0]) / "suite" / "walker.xml"
 
 
 @dataclasses.dataclass

@@ -20,6 +20,7 @@ from mjx_walk.algos.sac import SAC, SACConfig
 from mjx_walk.algos.td3 import TD3, TD3Config
 from mjx_walk.envs import Task
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.envs.registry import identity
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import with_name
 
@@ -83,7 +84,7 @@ def register_algorithm(name: str, algorithm: type[Algorithm], config: type) -> N
         raise UserError(f"the settings of '{name}' are {config!r}; derive them from OnPolicyConfig or OffPolicyConfig")
     if "__dataclass_fields__" not in vars(config):
         raise UserError(f"decorate {config.__name__}, the settings of '{name}', with @dataclasses.dataclass")
-    known = ALGORITHMS.get(name, (algorithm,))[0]
-    if (known.__module__, known.__qualname__) != (algorithm.__module__, algorithm.__qualname__):
-        raise UserError(f"an algorithm '{name}' is registered already, from {known.__module__}; choose another name")
+    if name in ALGORITHMS and identity(ALGORITHMS[name][0]) != identity(algorithm):
+        known = identity(ALGORITHMS[name][0])
+        raise UserError(f"an algorithm '{name}' is registered already, from {known}; choose another name")
     ALGORITHMS[name] = (algorithm, with_name(config, name))
