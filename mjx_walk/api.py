@@ -20,11 +20,12 @@ from mjx_walk.envs.registry import task_name
 from mjx_walk.envs.reward_files import only_known, reward_path
 from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium, score_in_sim
 from mjx_walk.runs import run_folder
-from mjx_walk.runs.config import Config, load_config, present_key, read_config
+from mjx_walk.runs.config import Config, load_config, read_config
 from mjx_walk.runs.loggers import require_wandb
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.own_tasks import KEY
 from mjx_walk.runs.policies import SavedPolicy, make_task
+from mjx_walk.runs.renamed import present_key
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.saved_yaml import read_yaml
 from mjx_walk.runs.scores import BEST, Scores
@@ -56,7 +57,8 @@ class Run(SavedPolicy):
         Args:
             episodes: number of episodes.
             backend: `gymnasium`, the real environment, or `sim`, the engine that the run was loaded with. Both score
-                Gymnasium's reward, `sim` with the run's shaping. A run's `reward_function` is not loaded.
+                Gymnasium's reward, `sim` with the run's shaping. A run's `reward_function` is not loaded. A task of
+                your own has no equal in Gymnasium: both backends score it in the engine.
             seed: seed of the resets.
         """
         if backend == "gymnasium":

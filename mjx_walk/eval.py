@@ -21,6 +21,7 @@ usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [policy=final|best] [episode
   policy=best         the policy with the highest evaluation during training
   backend=gymnasium   the real environment, on the CPU; writes eval_gymnasium.json into the run folder
   backend=sim         the run's own engine, or the one given by physics=
+  env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
 """
 
 

@@ -29,6 +29,7 @@ usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [policy=best|final] [seed=0]
                   meshcat)
   gait=FILE.png   a gait sheet: frames, height and speed of a body, floor contacts, motors, reward terms
   strip=FILE.png  eight frames side by side, over `seconds` from `start`
+  env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
   viewer=true     MuJoCo's live viewer, which needs a screen; it plays episodes until it is closed
 """
 

@@ -52,6 +52,9 @@ class WarpEngine:
         self._mjx_step = _over_batch(mjx.step, self._model)
         self._last_mjx_step = _over_batch(mjx.step, last_model)
         self._num_substeps = num_substeps
+        # Equality constraints and frictional joints have a row each in every step, unlike contacts and limits.
+        with_friction = np.count_nonzero(model.dof_frictionloss) + np.count_nonzero(model.tendon_frictionloss)
+        self._num_standing_rows = model.neq + with_friction
         self._derived = check_derived(model, derived, DataWarp)
         self.forward = batch_once(self._forward)
         self.step = batch_once(self._step)
@@ -68,7 +71,7 @@ class WarpEngine:
                 impl="warp",
                 device=jax.local_devices()[0],
                 naconmax=CONTACTS_PER_ENV * num_envs + SPARE_CONTACTS,
-                njmax=CONSTRAINTS_PER_ENV,
+                njmax=CONSTRAINTS_PER_ENV + self._num_standing_rows,
             )
             blank = jax.tree.map(np.asarray, blank)
         blank = jax.tree.map(lambda x: jnp.array(x) if x.any() else jnp.zeros(x.shape, x.dtype), blank)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import difflib
-import warnings
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import ENGINES
 from mjx_walk.runs.own_tasks import KEY, find_saved_task, name_task
 from mjx_walk.runs.recipes import CONFIG_DIR, base_recipe, fitting_recipes, recipe_names
+from mjx_walk.runs.renamed import present_overrides, under_present_names
 from mjx_walk.runs.saved_yaml import read_yaml
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import write_text
@@ -38,8 +38,6 @@ __all__ = [
     "compose_config",
     "flatten",
     "load_config",
-    "present_key",
-    "present_overrides",
     "read_config",
     "recipe_names",
     "register_schemas",
@@ -48,21 +46,6 @@ __all__ = [
     "training_command",
     "with_absolute_paths",
 ]
-
-_RENAMED = {
-    "updates_per_chunk": "iterations_per_call",
-    "checkpoint.every_chunks": "checkpoint.every_calls",
-    "algo.updates_per_step": "algo.grad_updates_per_step",
-    "algo.prefill_steps": "algo.learning_starts",
-    "algo.measured_steps": "algo.normalizer_warmup_steps_per_env",
-    "algo.return_bound": "algo.normalized_return_max",
-    "algo.stagger_episodes": "algo.init_at_random_episode_step",
-    "algo.max_unseen": "algo.max_tail_discount",
-    "algo.value_cost": "algo.value_loss_coef",
-    "algo.entropy_cost": "algo.entropy_coef",
-    "algo.mean_bound_cost": "algo.mean_bound_coef",
-}
-"""Present names of settings by their former names. Saved configurations load silently; command lines warn."""
 
 
 @dataclasses.dataclass
@@ -227,22 +210,6 @@ def _with_recipe(overrides: list[str]) -> list[str]:
     return [*overrides, f"recipe={recipe}"] if recipe else overrides
 
 
-def present_key(key: str) -> str:
-    """The present name of a setting."""
-    return _RENAMED.get(key, key)
-
-
-def present_overrides(overrides: list[str]) -> list[str]:
-    """Overrides under the present names of their settings. A former name warns."""
-    present = []
-    for override in overrides:
-        key, equals, value = override.partition("=")
-        if key in _RENAMED:
-            warnings.warn(f"{key} is now {_RENAMED[key]}; the former name still works", stacklevel=2)
-        present.append(present_key(key) + equals + value)
-    return present
-
-
 def _as_text(override: Override) -> str:
     """The override's text, quoted where Hydra reads a folder name such as 2026_11_23 as a number."""
     key, line = override.key_or_group, str(override.input_line)
@@ -276,7 +243,7 @@ def read_config(path: Path) -> Config:
         UserError: the file is not a configuration that this version reads.
     """
     try:
-        saved = _under_present_names(read_yaml(path))
+        saved = under_present_names(read_yaml(path))
         find_saved_task(saved.env.name, saved.env.get("task"), path)
         if saved.algo.name not in ALGORITHMS:
             raise UserError(f"the algorithm '{saved.algo.name}' of {path} is not known here; {_HOW_TO_REGISTER}")
@@ -293,16 +260,6 @@ _UNREADABLE = (
     *(LookupError, AttributeError, TypeError, ValueError, RecursionError),
     *(yaml.YAMLError, OmegaConfBaseException),
 )
-
-
-def _under_present_names(saved: Any) -> Any:
-    """Move the renamed settings of a saved configuration to their present names."""
-    for old, new in _RENAMED.items():
-        section, _, name = old.rpartition(".")
-        node = OmegaConf.select(saved, section) if section else saved
-        if node is not None and name in node:
-            node[new.rpartition(".")[2]] = node.pop(name)
-    return saved
 
 
 def _first_line(error: BaseException) -> str:

@@ -146,12 +146,12 @@ def _check(folder: RunFolder, config: Config) -> None:
         return
     saved = read_config(open_existing(folder.path).config)
     differing = differences(saved, config)
-    for key, old, new in (
-        ("reward_function", saved.env.reward_function, config.env.reward_function),
-        ("task", saved.env.task, config.env.task),
-    ):
-        if _name_same(old, new):  # the file may have moved
-            differing = [text for text in differing if not text.startswith(f"env.{key} ")]
+    moved = []  # files that may have moved; a task may also have come from Python
+    if _name_same(saved.env.reward_function, config.env.reward_function):
+        moved.append("env.reward_function ")
+    if not (saved.env.task and config.env.task) or _name_same(saved.env.task, config.env.task):
+        moved.append("env.task ")
+    differing = [text for text in differing if not text.startswith(tuple(moved))]
     if differing:
         raise UserError(f"resume=true with another configuration than {folder.config}: {'; '.join(differing)}")
     if folder.gymnasium_scores.exists() and not list_steps(folder.checkpoints):

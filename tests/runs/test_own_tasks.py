@@ -105,6 +105,9 @@ def test_a_class_from_python(home, capsys):
     line = refused(capsys, "eval", "run=run")
     assert line.startswith("error: the task 'lazy_walker' of run/config.yaml is not known here; to a command, add env.")
     assert mjx_walk.load_run("run", task=LazyWalker).task.observation_size == 17
+    (home / "work" / "t.py").write_text(TASK.format(ran="ran").replace("FastWalker", "LazyWalker"))
+    TASKS.pop("lazy_walker")
+    train_here("run", "resume=true", f"total_steps={TINY_CALL}", "env.task=t.py:LazyWalker", tiny=[])
     with pytest.raises(UserError, match="give task= or env=ant, not both"):
         mjx_walk.run(["env=ant"], task=LazyWalker)
     with pytest.raises(UserError, match=r"evaluation.films=true films in another process; name the task as env.task="):
