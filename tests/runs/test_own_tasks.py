@@ -53,10 +53,10 @@ def train_from_file(run_dir, *arguments):
     train_here(run_dir, "env.task=t.py:FastWalker", f"total_steps={TINY_CALL}", *arguments, tiny=OWN)
 
 
-def as_in_a_new_process():
+def as_in_a_new_process(name="fast_walker"):
     """Forget the task, as another process would."""
-    TASKS.pop("fast_walker")
-    registry._files.pop("fast_walker")
+    TASKS.pop(name)
+    registry._files.pop(name, None)
 
 
 def test_a_task_from_a_file_needs_no_name_later(home, capsys):
@@ -101,13 +101,14 @@ def test_a_class_from_python(home, capsys):
 
     run = mjx_walk.run([*OWN, "run_dir=run", f"total_steps={TINY_CALL}"], task=LazyWalker)
     assert run.config.env.name == "lazy_walker" and run.evaluate(episodes=1).env == "lazy_walker on c"
-    TASKS.pop("lazy_walker")
+    as_in_a_new_process("lazy_walker")
     line = refused(capsys, "eval", "run=run")
     assert line.startswith("error: the task 'lazy_walker' of run/config.yaml is not known here; to a command, add env.")
     assert mjx_walk.load_run("run", task=LazyWalker).task.observation_size == 17
     (home / "work" / "t.py").write_text(TASK.format(ran="ran").replace("FastWalker", "LazyWalker"))
-    TASKS.pop("lazy_walker")
+    as_in_a_new_process("lazy_walker")
     train_here("run", "resume=true", f"total_steps={TINY_CALL}", "env.task=t.py:LazyWalker", tiny=[])
+    as_in_a_new_process("lazy_walker")
     with pytest.raises(UserError, match="give task= or env=ant, not both"):
         mjx_walk.run(["env=ant"], task=LazyWalker)
     with pytest.raises(UserError, match=r"evaluation.films=true films in another process; name the task as env.task="):
