@@ -12,40 +12,17 @@ import difflib
 from pathlib import Path
 from typing import Any
 
-from mjx_walk.envs.ant import Ant, AntOptions
-from mjx_walk.envs.half_cheetah import HalfCheetah, HalfCheetahOptions
-from mjx_walk.envs.hopper import Hopper, HopperOptions
-from mjx_walk.envs.humanoid import Humanoid, HumanoidOptions
-from mjx_walk.envs.humanoid_standup import HumanoidStandup, HumanoidStandupOptions
-from mjx_walk.envs.inverted_double_pendulum import InvertedDoublePendulum, InvertedDoublePendulumOptions
-from mjx_walk.envs.inverted_pendulum import InvertedPendulum, InvertedPendulumOptions
-from mjx_walk.envs.pusher import Pusher, PusherOptions
-from mjx_walk.envs.reacher import Reacher, ReacherOptions
+from mjx_walk.envs.registry import BUILT_IN_TASKS, TASKS, register_task
 from mjx_walk.envs.state import NO_TIME_LIMIT, State, TrainableTask
-from mjx_walk.envs.swimmer import Swimmer, SwimmerOptions
 from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions, with_absolute_paths
 from mjx_walk.envs.view import View
-from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.utils.compat import prepare_jax
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import validate
 
-TASKS: dict[str, tuple[type[Task], type[TaskOptions]]] = {
-    "humanoid": (Humanoid, HumanoidOptions),
-    "humanoid_standup": (HumanoidStandup, HumanoidStandupOptions),
-    "walker2d": (Walker2d, Walker2dOptions),
-    "ant": (Ant, AntOptions),
-    "half_cheetah": (HalfCheetah, HalfCheetahOptions),
-    "hopper": (Hopper, HopperOptions),
-    "swimmer": (Swimmer, SwimmerOptions),
-    "reacher": (Reacher, ReacherOptions),
-    "pusher": (Pusher, PusherOptions),
-    "inverted_pendulum": (InvertedPendulum, InvertedPendulumOptions),
-    "inverted_double_pendulum": (InvertedDoublePendulum, InvertedDoublePendulumOptions),
-}
-
 __all__ = [
+    "BUILT_IN_TASKS",
     "NO_TIME_LIMIT",
     "TASKS",
     "State",
@@ -55,6 +32,7 @@ __all__ = [
     "View",
     "make_env",
     "make_options",
+    "register_task",
     "with_absolute_paths",
 ]
 
@@ -63,7 +41,7 @@ def make_env(name: str, physics: str = "auto", **kwargs: Any) -> Task:
     """Create one unbatched environment.
 
     Args:
-        name: a key of `TASKS`, such as `humanoid`.
+        name: a key of `TASKS`, such as `humanoid`, or the name of a registered task.
         physics: `auto`, `warp`, `jax` or `c`.
         **kwargs: env options: `version` (`v5` or `v4`), `max_episode_steps`, `shaping`, `reward_function`, and the
             keyword arguments of the Gymnasium class.
@@ -85,7 +63,7 @@ def make_options(name: str, **kwargs: Any) -> TaskOptions:
     if name not in TASKS:
         raise UserError(f"unknown env '{name}'; choose one of: {', '.join(TASKS)}")
     options_class = TASKS[name][1]
-    known = [field.name for field in dataclasses.fields(options_class) if field.name != "name"]
+    known = [field.name for field in dataclasses.fields(options_class) if field.name not in ("name", "task")]
     for option in kwargs:
         if option not in known:
             near = difflib.get_close_matches(option, known, n=1)

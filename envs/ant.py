@@ -7,6 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs.info import Info, plane_position, plane_velocity
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_normal_velocity
 from mjx_walk.envs.reward_shaping import Terms
@@ -52,6 +53,7 @@ class Ant(Task):
     V5_ONLY = ("frame_skip", "forward_reward_weight", "main_body", "include_cfrc_ext_in_observation")
     V4_ONLY = ("use_contact_forces",)
     HEIGHT_INDEX = 2
+    MODEL_NEEDS = ModelNeeds(positions=3)
 
     options: AntOptions
 

@@ -7,6 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs.info import Info
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
@@ -48,6 +49,7 @@ class Hopper(Task):
     V4_INFO_HAS_TERMS = False
     HAS_Y = False
     HEIGHT_INDEX = 1
+    MODEL_NEEDS = ModelNeeds(positions=3)
 
     options: HopperOptions
 

@@ -8,6 +8,7 @@ from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
 from mjx_walk.envs.info import Info
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.state import State
@@ -43,6 +44,7 @@ class HumanoidBody(Task):
     )
 
     HEIGHT_INDEX = 2
+    MODEL_NEEDS = ModelNeeds(positions=3)
 
     options: HumanoidBodyOptions
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_normal_velocity
 from mjx_walk.envs.reward_shaping import Terms
@@ -42,6 +43,7 @@ class InvertedDoublePendulum(Task):
     V4_INFO_HAS_TERMS = False
     V5_ONLY = (*Task.V5_ONLY, "healthy_reward", "reset_noise_scale")
     HAS_Y = False
+    MODEL_NEEDS = ModelNeeds(positions=2, velocities=3, sites=1)
     VIEW = View(body=3, center=(0.0, 0.0, 0.5))
 
     options: InvertedDoublePendulumOptions

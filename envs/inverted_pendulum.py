@@ -7,6 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs.info import Info
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
@@ -41,6 +42,7 @@ class InvertedPendulum(Task):
     V4_INFO_HAS_TERMS = False
     V5_ONLY = (*Task.V5_ONLY, "reset_noise_scale")
     HAS_Y = False
+    MODEL_NEEDS = ModelNeeds(positions=2)
     VIEW = View(body=2, center=(0.0, 0.0, 0.2), distance=2.5)
 
     options: InvertedPendulumOptions

@@ -1,6 +1,8 @@
 """MuJoCo models: where `xml_file` finds one, loading it, and looking up its parts."""
 
+import logging
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium
 import mujoco
@@ -9,6 +11,20 @@ from jaxtyping import Int
 
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.quiet_mujoco import hide_deprecations
+
+_LOGGER = logging.getLogger(__name__)
+
+
+class ModelNeeds(NamedTuple):
+    """Least sizes of a model, whose arrays a task reads by index."""
+
+    positions: int = 1
+    """Coordinates, MuJoCo's `nq`."""
+    velocities: int = 1
+    """Degrees of freedom, MuJoCo's `nv`."""
+    sites: int = 0
+    is_exact: bool = False
+    """Whether a model with more positions or velocities is refused, too."""
 
 
 def model_path(xml_file: str) -> Path:
@@ -49,6 +65,70 @@ def body_id(model: mujoco.MjModel, body: int | str) -> int:
     except (KeyError, IndexError) as error:
         names = ", ".join(model.body(i).name or str(i) for i in range(model.nbody))
         raise UserError(f"the model has no body '{body}', which the task reads; its bodies: {names}") from error
+
+
+def check_model(model: mujoco.MjModel, task: str, needs: ModelNeeds) -> None:
+    """Check that a task can read a model, and that a policy can move its motors.
+
+    Args:
+        model: the model.
+        task: name of the task.
+        needs: what the task reads by index.
+
+    Raises:
+        UserError: the model is too small, has no motor, or has a motor without a control range.
+    """
+    least = "exactly" if needs.is_exact else "at least"
+    for name, needed, found in (
+        ("positions (nq)", needs.positions, model.nq),
+        ("velocities (nv)", needs.velocities, model.nv),
+        ("site(s)", needs.sites, model.nsite),
+    ):
+        if found < needed or (needs.is_exact and found > needed and name != "site(s)"):
+            raise UserError(f"{task} needs a model with {least} {needed} {name}; this one has {found}")
+    if not model.nu:
+        raise UserError(f"{task} needs a model with motors; this one has no <actuator>")
+    if model.nu != model.nactuator:
+        raise UserError("the model has motors with several controls; give each motor one control")
+    low, high = model.actuator_ctrlrange.T
+    for i in np.flatnonzero(~(np.isfinite(low) & np.isfinite(high) & (low < high))):
+        motor = model.actuator(int(i)).name or int(i)
+        raise UserError(f"motor '{motor}' of the model has no range of controls; give it ctrlrange=\"LOW HIGH\"")
+
+
+def warn_of_coordinates(model: mujoco.MjModel, task: str, has_x: bool, height: int | None) -> None:
+    """Log a warning if a task reads other coordinates of a model as x and as the height, as Gymnasium does.
+
+    Args:
+        model: the model.
+        task: name of the task.
+        has_x: whether the task reads `qpos[0]` as x.
+        height: index in `qpos` that the task reads as the height, if it reads one.
+    """
+    read = [(0, 0, "x")] if has_x else []
+    read += [(height, 2, "height")] if height is not None else []
+    for index, axis, name in read:
+        if not is_coordinate(model, index, axis):
+            _LOGGER.warning("qpos[%d] of this model is not the %s, but %s reads it so, as Gymnasium", index, name, task)
+
+
+def is_coordinate(model: mujoco.MjModel, index: int, axis: int) -> bool:
+    """Whether an element of `qpos` is the root's position along an axis of the world.
+
+    Args:
+        model: the model.
+        index: of the element.
+        axis: 0 for x, 1 for y, 2 for z.
+    """
+    if index >= model.nq:
+        return False
+    joint = int(np.flatnonzero(model.jnt_qposadr <= index)[-1])
+    if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+        return index - model.jnt_qposadr[joint] == axis
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    is_root = model.body_parentid[model.jnt_bodyid[joint]] == 0
+    return bool(is_root and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE and data.xaxis[joint, axis] > 0.99)
 
 
 def motor_dofs(model: mujoco.MjModel) -> Int[np.ndarray, " motors"]:

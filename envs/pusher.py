@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import Terms
@@ -23,6 +24,8 @@ OBJECT_LOW, OBJECT_HIGH = (-0.3, -0.2), (0.0, 0.2)
 MIN_GOAL_DISTANCE = 0.17
 """Least distance of the object from the goal at a reset, m."""
 NUM_JOINTS = 7
+NUM_PLACED = 4
+"""Coordinates of the object and the goal, the last ones."""
 
 
 @dataclasses.dataclass
@@ -48,6 +51,7 @@ class Pusher(Task):
     MISSING_VERSIONS = {"v4": "Gymnasium supports Pusher-v4 only with MuJoCo below 3"}
     REWARD_TERMS = {"v5": ("reward_dist", "reward_ctrl", "reward_near")}
     HAS_X = HAS_Y = False
+    MODEL_NEEDS = ModelNeeds(positions=NUM_JOINTS + NUM_PLACED, velocities=NUM_JOINTS + NUM_PLACED)
     VIEW = View(body=11, center=(0.4, -0.2, -0.2), distance=2.2, elevation=-40.0, azimuth=200.0)
 
     options: PusherOptions
@@ -55,7 +59,8 @@ class Pusher(Task):
     def initial_state(self, key: PRNGKeyArray) -> InitialState:
         """Draw joint velocities, and an object that is not too close to the goal."""
         object_key, velocity_key = jax.random.split(key)
-        velocities = jax.random.uniform(velocity_key, (NUM_JOINTS,), minval=-VELOCITY_NOISE, maxval=VELOCITY_NOISE)
+        moving = self.model.nv - NUM_PLACED
+        velocities = jax.random.uniform(velocity_key, (moving,), minval=-VELOCITY_NOISE, maxval=VELOCITY_NOISE)
         low, high = jnp.float32(OBJECT_LOW), jnp.float32(OBJECT_HIGH)
 
         def draw(drawn):
@@ -66,7 +71,7 @@ class Pusher(Task):
             lambda drawn: jnp.linalg.norm(drawn[1]) <= MIN_GOAL_DISTANCE, draw, (object_key, jnp.zeros(2))
         )
         qpos = self.init_qpos.at[-4:-2].set(position).at[-2:].set(0.0)
-        return qpos, self.init_qvel.at[:NUM_JOINTS].add(velocities).at[-4:].set(0.0)
+        return qpos, self.init_qvel.at[:moving].add(velocities).at[moving:].set(0.0)
 
     def named_bodies(self) -> tuple[int | str, ...]:
         return ("tips_arm", "object", "goal")

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import Terms
@@ -47,6 +48,7 @@ class Reacher(Task):
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_dist", "reward_ctrl"))
     V5_ONLY = (*Task.V5_ONLY, "reward_dist_weight", "reward_control_weight")
     HAS_X = HAS_Y = False
+    MODEL_NEEDS = ModelNeeds(positions=4, velocities=4, is_exact=True)
     VIEW = View(body=3, center=(0.0, 0.0, 0.0), distance=1.1, elevation=-90.0)
 
     options: ReacherOptions

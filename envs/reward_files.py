@@ -1,4 +1,4 @@
-"""Reward functions from Python files, and the helper modules beside them."""
+"""Reward functions and tasks from Python files, and the helper modules beside them."""
 
 import hashlib
 import importlib.abc
@@ -7,14 +7,22 @@ import importlib.util
 import itertools
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["RewardFile", "absolute_source", "changed_file", "load_reward_function", "only_known", "reward_path"]
+__all__ = [
+    "RewardFile",
+    "absolute_source",
+    "changed_file",
+    "load_from_file",
+    "load_reward_function",
+    "only_known",
+    "reward_path",
+]
 
 _NUMBERS = itertools.count()
 _PREFIX = "_mjx_walk_reward_"
@@ -67,21 +75,22 @@ def only_known(path: Path, hashes: Mapping[str, str] | None) -> None:
 
 
 class RewardFile:
-    """A function of a Python file. The modules beside the file are importable while it is loaded and while it runs.
+    """A function or class of a Python file. Modules beside the file are importable while it loads and while it runs.
 
     Its modules come from the source only: a file in `__pycache__` is never run. Helpers have their usual names, but
     leave `sys.modules` afterwards, so that another reward file's helper of the same name is another module.
     """
 
-    def __init__(self, path: Path, name: str):
+    def __init__(self, path: Path, name: str, kind: str = "function"):
         """
         Args:
             path: absolute path of the file.
-            name: of the function.
+            name: of the function or class.
+            kind: `function` or `class`, for messages.
 
         Raises:
             Exception: whatever the file raises.
-            UserError: it has no such function, or may not run a file.
+            UserError: it has no such function or class, or may not run a file.
         """
         self._finder = _Finder(path.parent, _known.get(path))
         module_name = f"{_PREFIX}{next(_NUMBERS)}"  # dataclasses look their module up in sys.modules
@@ -90,18 +99,19 @@ class RewardFile:
         try:
             with self._finder:
                 self._finder.exec_module(module)
-            function = vars(module).get(name)
-            if not callable(function):
-                raise UserError(f"'{path}' has no function '{name}'")
+            value = vars(module).get(name)
+            if not callable(value):
+                raise UserError(f"'{path}' has no {kind} '{name}'")
         except BaseException:
             del sys.modules[module_name]
             raise
-        self._function: Callable[..., Any] = function
+        self.value: Any = value
+        """The function or class. A function is called with `__call__`, which makes the helpers importable."""
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the function."""
         with self._finder:
-            return self._function(*arguments)
+            return self.value(*arguments)
 
     @property
     def hashes(self) -> dict[str, str]:
@@ -195,15 +205,29 @@ def load_reward_function(source: str) -> RewardFile:
     Raises:
         UserError: the file or the function does not exist, or the file raises an exception.
     """
+    return load_from_file("env.reward_function", source, "FUNCTION")
+
+
+def load_from_file(key: str, source: str, kind: str) -> RewardFile:
+    """Load a function or class from a Python file.
+
+    Args:
+        key: the setting that names it, for messages.
+        source: `PATH.py:NAME`.
+        kind: what NAME is, `FUNCTION` or `CLASS`.
+
+    Raises:
+        UserError: the file or the name does not exist, or the file raises an exception.
+    """
     path, name = reward_path(source), source.rpartition(":")[2]
-    problem = f"env.reward_function={source}: "
+    problem = f"{key}={source}: "
     if not path.is_file():
         given = source.rpartition(":")[0] or source
-        raise UserError(f"{problem}no file '{given}'; write PATH.py:FUNCTION")
+        raise UserError(f"{problem}no file '{given}'; write PATH.py:{kind}")
     if path.suffix != ".py":
-        raise UserError(f"{problem}'{path}' is not a Python file; write PATH.py:FUNCTION")
+        raise UserError(f"{problem}'{path}' is not a Python file; write PATH.py:{kind}")
     try:
-        return RewardFile(path, name)
+        return RewardFile(path, name, kind.lower())
     except UserError as error:
         raise UserError(f"{problem}{error}") from error
     except (Exception, SystemExit) as error:

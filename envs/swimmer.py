@@ -7,6 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs.info import Info, plane_position, plane_velocity
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
@@ -39,6 +40,7 @@ class Swimmer(Task):
     XML_FILES = {"v5": "swimmer.xml", "v4": "swimmer.xml"}
     REWARD_TERMS = {"v5": ("reward_forward", "reward_ctrl"), "v4": ("reward_fwd", "reward_ctrl")}
     VIEW = View(distance=8.0, elevation=-60.0)
+    MODEL_NEEDS = ModelNeeds(positions=2)
 
     options: SwimmerOptions
 

@@ -10,15 +10,25 @@ from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs.info import GymnasiumInfo
-from mjx_walk.envs.models import body_id, load_model, motor_dofs
+from mjx_walk.envs.models import (
+    ModelNeeds,
+    body_id,
+    check_model,
+    is_coordinate,
+    load_model,
+    motor_dofs,
+    warn_of_coordinates,
+)
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_files import load_reward_function
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, shaping_terms, term_names
 from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape
-from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.task_options import TaskOptions, check_version
 from mjx_walk.envs.view import View
 from mjx_walk.utils.errors import UserError
+
+__all__ = ["MAX_ABS_VALUE", "Task", "View"]
 
 MAX_ABS_VALUE = 1e10
 """Largest valid position or velocity, as in MuJoCo's own check (`mjMAXVAL`)."""
@@ -31,7 +41,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     """
 
     GYMNASIUM_NAME: str
-    """Name in Gymnasium's registry, without the version."""
+    """Name in Gymnasium's registry, without the version. A class that does not name it has no equal in Gymnasium."""
     XML_FILES: dict[str, str]
     """Model file of each version, among Gymnasium's assets."""
     REWARD_TERMS: dict[str, tuple[str, ...]]
@@ -42,6 +52,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     """Env options that Gymnasium's v5 class does not take."""
     MISSING_VERSIONS: dict[str, str] = {}
     """Why a version is not available, by version."""
+    MODEL_NEEDS: ModelNeeds = ModelNeeds()
+    """What the task reads of a model by index."""
     HAS_X: bool = True
     """Whether `qpos[0]` is the root's forward coordinate x."""
     HAS_Y: bool = True
@@ -49,6 +61,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     HEIGHT_INDEX: int | None = None
     """Index of the root's height in `qpos`. None: the root cannot leave the ground."""
     VIEW: View = View()
+    """What films show of the task's own model. `view` is for the model of `xml_file`."""
 
     def __init__(self, options: TaskOptions, physics: str = "auto", keep_info: bool = False):
         """
@@ -60,12 +73,18 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 
         Raises:
             UserError: an unknown version or engine, an option that the version does not take, shaping that has no
-                effect, a model file or reward function that is missing or invalid, or a body that the model lacks.
+                effect, a model file or reward function that is missing or invalid, or a model that lacks what the task
+                reads or has what the engine does not simulate.
         """
-        _check_version(self, options)
+        check_version(options, self.XML_FILES, self.MISSING_VERSIONS, {"v5": self.V5_ONLY, "v4": self.V4_ONLY})
         self.options = options
         self.max_episode_steps = options.max_episode_steps
         self.model = load_model(options.xml_file or self.XML_FILES[options.version])
+        self.body_ids = {body: body_id(self.model, body) for body in self.named_bodies()}
+        check_model(self.model, options.name, self.MODEL_NEEDS)
+        if options.xml_file:
+            warn_of_coordinates(self.model, options.name, self.HAS_X, self.HEIGHT_INDEX)
+        self.view = self.VIEW._replace(body=min(self.VIEW.body, self.model.nbody - 1))
         self.dt = self.model.opt.timestep * options.frame_skip
         self.kept_arrays = self.info_arrays() if keep_info else ()
         derived = tuple(dict.fromkeys((*self.derived_names(), *self.kept_arrays)))
@@ -73,7 +92,6 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         low, high = self.model.actuator_ctrlrange.T
         self.action_low, self.action_high = jnp.float32(low), jnp.float32(high)
         self.action_size = self.model.nu
-        self.body_ids = {body: body_id(self.model, body) for body in self.named_bodies()}
         self.init_qpos = jnp.asarray(self.model.qpos0, jnp.float32)
         self.init_qvel = jnp.zeros(self.model.nv, jnp.float32)
         self.observation_size = sum(self.observation_blocks().values())
@@ -89,17 +107,24 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 
     def _check_shaping(self) -> None:
         name, shaping = self.options.name, self.options.shaping
-        if shaping.backward and not self.HAS_X:
+        if shaping.backward and not (self.HAS_X and is_coordinate(self.model, 0, axis=0)):
             raise UserError(f"env.shaping.backward={shaping.backward}: {name} has no x coordinate; set it to 0")
-        if shaping.keep_y and not self.HAS_Y:
+        if shaping.keep_y and not (self.HAS_Y and is_coordinate(self.model, 1, axis=1)):
             raise UserError(f"env.shaping.keep_y={shaping.keep_y}: {name} has no y coordinate; set it to 0")
+        if shaping.shaking and not self._motor_dofs.size:
+            raise UserError(f"env.shaping.shaking={shaping.shaking}: no motor drives a joint; set it to 0")
         if shaping.falling and not self.terminates_on_fall:
             raise UserError(f"env.shaping.falling={shaping.falling}: no fall terminates this {name}; set it to 0")
 
     @property
+    def is_in_gymnasium(self) -> bool:
+        """Whether Gymnasium has an equivalent environment. A subclass does not inherit it."""
+        return "GYMNASIUM_NAME" in vars(type(self))
+
+    @property
     def gymnasium_id(self) -> str:
-        """Id of the equivalent environment in Gymnasium."""
-        return f"{self.GYMNASIUM_NAME}-{self.options.version}"
+        """Id of the equivalent environment in Gymnasium; without one, the task's name."""
+        return f"{self.GYMNASIUM_NAME}-{self.options.version}" if self.is_in_gymnasium else self.options.name
 
     def gymnasium_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of `gymnasium.make` for the equivalent environment, without those at their default."""
@@ -276,20 +301,3 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 def _is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[Array, ""]:
     """Whether all elements are below `limit` in absolute value; NaN never is."""
     return jnp.array([jnp.all(jnp.abs(x) < limit) for x in arrays]).all()
-
-
-def _check_version(task: Task, options: TaskOptions) -> None:
-    """Check that Gymnasium has the version, and that its class takes the options that differ from their defaults.
-
-    Raises:
-        UserError: it does not.
-    """
-    name, version = options.name, options.version
-    if version not in task.XML_FILES:
-        reason = task.MISSING_VERSIONS.get(version, f"unknown version '{version}' of {name}")
-        raise UserError(f"{reason}; choose one of: {', '.join(task.XML_FILES)}")
-    for only, other in (("v5", "v4"), ("v4", "v5")):
-        names = task.V5_ONLY if only == "v5" else task.V4_ONLY
-        refused = [option for option in names if option in options.changed()]
-        if version == other and refused:
-            raise UserError(f"{name} {version} does not take {', '.join(refused)}; use version={only}")

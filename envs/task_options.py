@@ -1,6 +1,7 @@
 """Env options that all tasks share."""
 
 import dataclasses
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ class TaskOptions:
     """Weights of additional reward terms."""
     reward_function: str | None = None
     """`PATH.py:FUNCTION`, a custom reward that replaces Gymnasium's; see `mjx_walk.envs.reward_shaping`."""
+    task: str | None = None
+    """`PATH.py:CLASS`, for a task of your own from a file; see `mjx_walk.envs.registry`."""
 
     def __post_init__(self):
         for name, value in list(vars(self).items()):
@@ -46,8 +49,32 @@ class TaskOptions:
         return {name: value for name, value in self.changed().items() if name not in _NOT_IN_GYMNASIUM}
 
 
-_NOT_IN_GYMNASIUM = ("name", "version", "max_episode_steps", "shaping", "reward_function")
+_NOT_IN_GYMNASIUM = ("name", "version", "max_episode_steps", "shaping", "reward_function", "task")
 """Fields of `TaskOptions` that the constructors of Gymnasium's classes do not take."""
+
+
+def check_version(
+    options: TaskOptions, available: Iterable[str], missing: Mapping[str, str], exclusive: Mapping[str, tuple[str, ...]]
+) -> None:
+    """Check that Gymnasium has the version, and that its class takes the options that differ from their defaults.
+
+    Args:
+        options: env options.
+        available: versions of the task.
+        missing: why a version is not available, by version.
+        exclusive: env options that only one version takes, by version.
+
+    Raises:
+        UserError: it does not.
+    """
+    name, version = options.name, options.version
+    if version not in available:
+        reason = missing.get(version, f"unknown version '{version}' of {name}")
+        raise UserError(f"{reason}; choose one of: {', '.join(available)}")
+    for only, other in (("v5", "v4"), ("v4", "v5")):
+        refused = [option for option in exclusive[only] if option in options.changed()]
+        if version == other and refused:
+            raise UserError(f"{name} {version} does not take {', '.join(refused)}; use version={only}")
 
 
 def with_absolute_paths(options: TaskOptions, folder: Path) -> TaskOptions:
@@ -61,4 +88,5 @@ def with_absolute_paths(options: TaskOptions, folder: Path) -> TaskOptions:
     if xml_file and (folder / Path(xml_file).expanduser()).is_file():
         xml_file = str((folder / Path(xml_file).expanduser()).resolve())
     source = absolute_source(source, folder) if source else source
-    return dataclasses.replace(options, xml_file=xml_file, reward_function=source)
+    task = absolute_source(options.task, folder) if options.task else None
+    return dataclasses.replace(options, xml_file=xml_file, reward_function=source, task=task)

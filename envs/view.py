@@ -1,4 +1,4 @@
-"""The view of a task: where films, pages and gait sheets look."""
+"""What films, pages and gait sheets show of a task."""
 
 from typing import NamedTuple
 

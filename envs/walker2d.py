@@ -7,6 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs.info import Info
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
@@ -45,6 +46,7 @@ class Walker2d(Task):
     XML_FILES = {"v5": "walker2d_v5.xml", "v4": "walker2d.xml"}
     HAS_Y = False
     HEIGHT_INDEX = 1
+    MODEL_NEEDS = ModelNeeds(positions=3)
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_forward", "reward_ctrl", "reward_survive"))
     V4_INFO_HAS_TERMS = False
 

@@ -9,11 +9,21 @@ from typing import TYPE_CHECKING, Any
 from mjx_walk.interop.registration import register
 from mjx_walk.utils.versions import __version__
 
-__all__ = ["BraxEnv", "__version__", "load_run", "make_env", "prepare_jax", "run"]
+__all__ = [
+    "BraxEnv",
+    "__version__",
+    "load_run",
+    "make_env",
+    "prepare_jax",
+    "register_algorithm",
+    "register_task",
+    "run",
+]
 
 if TYPE_CHECKING:
+    from mjx_walk.algos import register_algorithm
     from mjx_walk.api import load_run, run
-    from mjx_walk.envs import make_env
+    from mjx_walk.envs import make_env, register_task
     from mjx_walk.interop.brax_env import BraxEnv
     from mjx_walk.utils.compat import prepare_jax
 
@@ -22,6 +32,8 @@ _WHERE = {
     "load_run": "mjx_walk.api",
     "make_env": "mjx_walk.envs",
     "prepare_jax": "mjx_walk.utils.compat",
+    "register_algorithm": "mjx_walk.algos",
+    "register_task": "mjx_walk.envs",
     "run": "mjx_walk.api",
 }
 

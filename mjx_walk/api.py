@@ -10,19 +10,24 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import yaml
 
 from mjx_walk import zoo
 from mjx_walk.algos import make_algorithm
-from mjx_walk.envs import Task
+from mjx_walk.envs import BUILT_IN_TASKS, Task, register_task
 from mjx_walk.envs.physics import resolve_engine
+from mjx_walk.envs.registry import task_name
 from mjx_walk.envs.reward_files import only_known, reward_path
 from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium, score_in_sim
 from mjx_walk.runs import run_folder
-from mjx_walk.runs.config import Config, load_config, present_key, read_config
+from mjx_walk.runs.config import Config, load_config, read_config
 from mjx_walk.runs.loggers import require_wandb
 from mjx_walk.runs.metrics import Row, read_rows
+from mjx_walk.runs.own_tasks import KEY
 from mjx_walk.runs.policies import SavedPolicy, make_task
+from mjx_walk.runs.renamed import present_key
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.saved_yaml import read_yaml
 from mjx_walk.runs.scores import BEST, Scores
 from mjx_walk.runs.trust import remember, require_trusted
 from mjx_walk.training.distributed import Processes
@@ -52,7 +57,8 @@ class Run(SavedPolicy):
         Args:
             episodes: number of episodes.
             backend: `gymnasium`, the real environment, or `sim`, the engine that the run was loaded with. Both score
-                Gymnasium's reward, `sim` with the run's shaping. A run's `reward_function` is not loaded.
+                Gymnasium's reward, `sim` with the run's shaping. A run's `reward_function` is not loaded. A task of
+                your own has no equal in Gymnasium: both backends score it in the engine.
             seed: seed of the resets.
         """
         if backend == "gymnasium":
@@ -63,19 +69,34 @@ class Run(SavedPolicy):
         return score_in_sim(self.task, policy, episodes, seed)
 
 
-def load_run(path: str | Path, physics: str | None = None, policy: str = BEST) -> Run:
+def load_run(path: str | Path, physics: str | None = None, policy: str = BEST, task: type[Task] | None = None) -> Run:
     """Load a run.
 
     Args:
         path: its folder, or `zoo:NAME`.
         physics: engine to use instead of the run's own.
         policy: `best`, the policy with the highest evaluation during training, or `final`, the newest one.
+        task: the run's task, if it is your own, and neither registered nor in a file that you trust.
 
     Raises:
         UserError: no run, or no usable policy at that path.
     """
     prepare_jax()
-    return Run(zoo.open_run(path), physics, policy)
+    folder = zoo.open_run(path)
+    if task is not None:
+        _register_for(folder, task)
+    return Run(folder, physics, policy)
+
+
+def _register_for(folder: RunFolder, task: type[Task]) -> None:
+    """Register a task under the name that a run has for its own."""
+    try:
+        name = str(read_yaml(folder.config).env.name)
+    except (OSError, ValueError, LookupError, AttributeError, RecursionError, yaml.YAMLError):
+        return  # the loading says what is wrong
+    if name in BUILT_IN_TASKS:
+        raise UserError(f"{folder.path} trained {name}, a task of this package; leave out task=")
+    register_task(name, task)
 
 
 def resolve(overrides: list[str]) -> Config:
@@ -123,6 +144,8 @@ def train(
     """
     require_wandb(configs[0])
     if configs[0].evaluation.films:
+        if configs[0].env.name not in BUILT_IN_TASKS and not configs[0].env.task:
+            raise UserError(f"evaluation.films=true films in another process; name the task as {KEY}=FILE.py:CLASS")
         choose_opengl()
     physics = resolve_engine(configs[0].physics)
     configs = [dataclasses.replace(config, physics=physics) for config in configs]
@@ -172,12 +195,17 @@ def _resume_command(configs: list[Config], folders: list[RunFolder]) -> str:
     where = shlex.quote(f"run_dir={folders[0].path}")
     if len(folders) > 1:
         where = f"{shlex.quote(f'run_dir={folders[0].path.parent}')} 'seeds={[config.seed for config in configs]}'"
-    named = {"env.reward_function": configs[0].env.reward_function, "wandb_project": configs[0].wandb_project}
+    env = configs[0].env
+    named = {KEY: env.task, "env.reward_function": env.reward_function, "wandb_project": configs[0].wandb_project}
     again = "".join(f" {shlex.quote(f'{key}={value}')}" for key, value in named.items() if value)
     return f"python -m mjx_walk.train {where} resume=true{again}"
 
 
-def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | None = None) -> Run:
+def run(
+    overrides: list[str] | None = None,
+    on_metrics: Callable[[Row], None] | None = None,
+    task: type[Task] | None = None,
+) -> Run:
     """Train as `python -m mjx_walk.train` does, from Python.
 
     Messages and progress go to the logger `mjx_walk`, at level INFO.
@@ -185,13 +213,27 @@ def run(overrides: list[str] | None = None, on_metrics: Callable[[Row], None] | 
     Args:
         overrides: arguments of the command, such as `["env=walker2d", "total_steps=1_000_000"]`.
         on_metrics: called with every logged row.
+        task: a class of your own to train on, in place of `env=`. `MyRobot` is registered as `my_robot`.
 
     Raises:
         UserError: invalid overrides, or a run that cannot be trained here.
     """
     prepare_jax()
-    folders, _ = train([resolve(overrides or [])], on_metrics)
+    overrides = list(overrides or [])
+    if task is not None:
+        overrides = _with_task(overrides, task)
+    folders, _ = train([resolve(overrides)], on_metrics)
     return load_run(folders[0].path)
+
+
+def _with_task(overrides: list[str], task: type[Task]) -> list[str]:
+    """Register a task, and name it in the overrides. A resume takes the name from its saved configuration."""
+    for override in overrides:
+        if override.partition("=")[0] in ("env", KEY):
+            raise UserError(f"give task= or {override}, not both")
+    name = task_name(task)
+    register_task(name, task)
+    return overrides if "resume=true" in overrides else [f"env={name}", *overrides]
 
 
 def _as_saved(config: Config, overrides: list[str]) -> Config:

@@ -5,6 +5,7 @@ import warnings
 
 from mjx_walk import zoo
 from mjx_walk.api import Run, load_run
+from mjx_walk.runs.own_tasks import take_task
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.scores import BEST, FINAL, POLICIES, Scores, read_scores, write_scores
 from mjx_walk.training.summary import score_lines
@@ -20,6 +21,7 @@ usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [policy=final|best] [episode
   policy=best         the policy with the highest evaluation during training
   backend=gymnasium   the real environment, on the CPU; writes eval_gymnasium.json into the run folder
   backend=sim         the run's own engine, or the one given by physics=
+  env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
 """
 
 
@@ -35,7 +37,7 @@ class Arguments:
 
 def main(command_line: list[str]) -> None:
     """Score the policy, print the result, and save a Gymnasium score in the run folder."""
-    arguments = cli.parse(Arguments, command_line, USAGE)
+    arguments = cli.parse(Arguments, take_task(command_line), USAGE)
     if arguments.physics and arguments.backend == "gymnasium":
         raise UserError(f"physics={arguments.physics} needs backend=sim: Gymnasium has its own engine")
     folder = zoo.open_run(arguments.run)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from mjx_walk import zoo
 from mjx_walk.api import load_run
+from mjx_walk.runs.own_tasks import take_task
 from mjx_walk.runs.scores import BEST, POLICIES
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
@@ -20,6 +21,7 @@ usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [forma
                   maps `observation`, [N, observation_size], to `action`, [N, action_size] f32, both in Gymnasium's
                   units. It normalises observations itself.
   dtype=float64   of `observation`: Gymnasium's observations are float64
+  env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
 """
 
 
@@ -34,7 +36,7 @@ class Arguments:
 
 def main(command_line: list[str]) -> None:
     """Write the file."""
-    arguments = cli.parse(Arguments, command_line, USAGE)
+    arguments = cli.parse(Arguments, take_task(command_line), USAGE)
     cli.stay_on_cpu()
     folder = zoo.open_run(arguments.run)
     try:

@@ -7,6 +7,7 @@ import imageio.v3 as iio
 
 from mjx_walk import zoo
 from mjx_walk.api import load_run
+from mjx_walk.runs.own_tasks import take_task
 from mjx_walk.runs.scores import BEST, POLICIES
 from mjx_walk.utils import cli
 from mjx_walk.utils.files import replacing
@@ -28,6 +29,7 @@ usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [policy=best|final] [seed=0]
                   meshcat)
   gait=FILE.png   a gait sheet: frames, height and speed of a body, floor contacts, motors, reward terms
   strip=FILE.png  eight frames side by side, over `seconds` from `start`
+  env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
   viewer=true     MuJoCo's live viewer, which needs a screen; it plays episodes until it is closed
 """
 
@@ -50,7 +52,7 @@ class Arguments:
 
 def main(command_line: list[str]) -> None:
     """Play an episode, and write the files that the arguments name."""
-    arguments = cli.parse(Arguments, command_line, USAGE)
+    arguments = cli.parse(Arguments, take_task(command_line), USAGE)
     cli.stay_on_cpu()
     folder = zoo.open_run(arguments.run)
     if arguments.html:

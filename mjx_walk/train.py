@@ -23,11 +23,11 @@ from mjx_walk.runs.config import (
     complete_overrides,
     compose_config,
     load_config,
-    present_overrides,
     register_schemas,
     to_config,
     with_absolute_paths,
 )
+from mjx_walk.runs.renamed import present_overrides
 from mjx_walk.training import launcher
 from mjx_walk.training.distributed import Processes, join_processes
 from mjx_walk.utils import cli
@@ -47,6 +47,7 @@ usage: python -m mjx_walk.train [env=humanoid] [algo=ppo] [KEY=VALUE ...]
   seeds=N or [3,7]                        train several seeds in one program, each with its own folder
   devices=all or N                        train one run on N GPUs, with one process and num_envs environments each
   recipe=PATH_BELOW_configs/recipe        use another recipe than the default for the environment and the hardware
+  env.task=FILE.py:CLASS                  train on a task of your own, see docs/your_own.md
   env.KEY=VALUE                           set one of Gymnasium's keywords, or env.version=v4
   algo.KEY=VALUE                          set an algorithm's setting
   -m seed=0,1,2                           run a Hydra sweep; Hydra's launchers work

@@ -1,5 +1,6 @@
 """Run the commands as a user does, small."""
 
+import contextlib
 import os
 import re
 import runpy
@@ -12,6 +13,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
+from mjx_walk.algos import ALGORITHMS
+from mjx_walk.envs import registry
 from mjx_walk.runs import checkpoint
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing import rendering
@@ -159,6 +162,19 @@ def flip_a_byte(folder):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(data)
+
+
+@contextlib.contextmanager
+def unregistered():
+    """Forget the tasks and algorithms that are registered inside the block."""
+    tables = (registry.TASKS, registry._files, ALGORITHMS)
+    former = [dict(table) for table in tables]
+    try:
+        yield
+    finally:
+        for table, content in zip(tables, former, strict=True):
+            table.clear()
+            table.update(content)
 
 
 def can_render():

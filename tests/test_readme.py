@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -119,6 +120,9 @@ def test_every_command(line, small_run, tmp_path, monkeypatch):
     """As it stands there, but for sizes and places."""
     monkeypatch.chdir(tmp_path)
     exec(compile(file("heavy_torso.py"), "heavy_torso.py", "exec"), {})
+    if "own_robot.py" in line:
+        pytest.importorskip("dm_control")
+        shutil.copytree(CLONE / "docs" / "examples", "docs/examples")
     line = re.sub(r" (num_envs=N|total_steps=N|viewer=true)", "", line).replace("RUN_DIR", str(small_run))
     line = re.sub(r" seeds=\d+", " seeds=2", line)
     line = re.sub(r"=(PATH|DIR|/shared/humanoid)", f"={tmp_path}/there", line)

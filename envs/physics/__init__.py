@@ -10,6 +10,7 @@ import jax
 import mujoco
 
 from mjx_walk.envs.physics.base import Derived, Engine, PhysicsState
+from mjx_walk.envs.physics.supported import refuse_unsupported, unsupported_by_mjx, warn_of_approximations
 from mjx_walk.utils.errors import UserError
 
 ENGINES = ("warp", "jax", "c")
@@ -56,7 +57,7 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
         derived: names of the `mjData` arrays that the task reads.
 
     Raises:
-        UserError: the model's integrator is implicit.
+        UserError: the engine does not simulate something that the model has.
     """
     integrator = mujoco.mjtIntegrator(model.opt.integrator)
     if integrator not in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4):
@@ -64,12 +65,24 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
         raise UserError(
             f"the model's integrator '{given}' is not supported; set integrator to Euler or RK4 in <option>"
         )
+    refuse_unsupported(model, name)
     if name == "c":
         from mjx_walk.envs.physics.mujoco_c import CEngine
 
         return CEngine(model, num_substeps, derived)
-    from mjx_walk.utils import quiet_mjx  # noqa: F401
+    try:
+        return _make_mjx_engine(name, model, num_substeps, derived)
+    except UserError:
+        raise
+    except (NotImplementedError, ValueError) as error:
+        raise unsupported_by_mjx(name, error) from error
 
+
+def _make_mjx_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Engine:
+    from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
+    from mjx_walk.envs.physics.mjx_model import MIN_SOLVER_ITERATIONS
+
+    warn_of_approximations(model, name, MIN_SOLVER_ITERATIONS)
     if name == "warp":
         from mjx_walk.envs.physics.mjx_warp import WarpEngine
 

@@ -6,9 +6,12 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jax import Array
 from jax.custom_batching import custom_vmap
 from jaxtyping import Bool, Float
+
+from mjx_walk.utils.errors import UserError
 
 Derived = dict[str, Array]
 """MuJoCo arrays by their `mjData` names, for example `cinert`, `[nbody, 10] f32`."""
@@ -23,6 +26,19 @@ class PhysicsState(NamedTuple):
     """`[nv] f32`, m/s and rad/s."""
     qacc_warmstart: Array
     """`[nv] f32`, m/s² and rad/s²."""
+
+
+def derived_shapes(model: mujoco.MjModel, names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
+    """Shapes of derived arrays, which are the same on every engine.
+
+    Raises:
+        UserError: `mjData` has no such array.
+    """
+    blank = mujoco.MjData(model)
+    for name in names:
+        if not isinstance(getattr(blank, name, None), np.ndarray):
+            raise UserError(f"MuJoCo's mjData has no array '{name}', which the task names in derived_names")
+    return {name: np.shape(getattr(blank, name)) for name in names}
 
 
 class Engine(Protocol):

@@ -11,10 +11,11 @@ from mujoco import mjx
 from mujoco.mjx._src import forward as mjx_forward
 from mujoco.mjx._src import scan as mjx_scan
 from mujoco.mjx._src import smooth as mjx_smooth
+from mujoco.mjx._src import types as mjx_types
 
 from mjx_walk.envs.physics import capsule_frames_jax
 from mjx_walk.envs.physics.base import Derived, PhysicsState
-from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
+from mjx_walk.envs.physics.mjx_model import check_derived, read_derived, with_newton_solver
 
 _RK4_STEP = (0.0, 0.5, 0.5, 1.0)
 _RK4_WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
@@ -33,7 +34,7 @@ class JaxEngine:
         self._blank = mjx.make_data(model, impl="jax")
         self._substep = _runge_kutta_4 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else _euler
         self._num_substeps = num_substeps
-        self._derived = derived
+        self._derived = check_derived(model, derived, mjx_types.DataJAX)
 
     def change_model(self, changes: dict[str, Array]) -> None:
         """Step a changed model from now on, for domain randomization. A program compiled before keeps its model.

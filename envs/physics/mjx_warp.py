@@ -11,10 +11,11 @@ import warp as wp
 from jax import Array
 from jaxtyping import Bool, Float
 from mujoco import mjx
+from mujoco.mjx.warp.types import DataWarp
 
 from mjx_walk.envs.physics import capsule_frames_warp
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
-from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
+from mjx_walk.envs.physics.mjx_model import check_derived, read_derived, with_newton_solver
 
 CONTACTS_PER_ENV = 40
 """Mean capacity per environment for candidate geom pairs, and for contacts. The batch shares both buffers.
@@ -51,7 +52,10 @@ class WarpEngine:
         self._mjx_step = _over_batch(mjx.step, self._model)
         self._last_mjx_step = _over_batch(mjx.step, last_model)
         self._num_substeps = num_substeps
-        self._derived = derived
+        # Equality constraints and frictional joints have a row each in every step, unlike contacts and limits.
+        with_friction = np.count_nonzero(model.dof_frictionloss) + np.count_nonzero(model.tendon_frictionloss)
+        self._num_standing_rows = model.neq + with_friction
+        self._derived = check_derived(model, derived, DataWarp)
         self.forward = batch_once(self._forward)
         self.step = batch_once(self._step)
 
@@ -67,14 +71,14 @@ class WarpEngine:
                 impl="warp",
                 device=jax.local_devices()[0],
                 naconmax=CONTACTS_PER_ENV * num_envs + SPARE_CONTACTS,
-                njmax=CONSTRAINTS_PER_ENV,
+                njmax=CONSTRAINTS_PER_ENV + self._num_standing_rows,
             )
             blank = jax.tree.map(np.asarray, blank)
         blank = jax.tree.map(lambda x: jnp.array(x) if x.any() else jnp.zeros(x.shape, x.dtype), blank)
         return jax.vmap(lambda s: blank.replace(qpos=s.qpos, qvel=s.qvel, qacc_warmstart=s.qacc_warmstart))(state)
 
     def _forward(self, state: PhysicsState) -> Derived:
-        return read_derived(self._mjx_forward(self._data(state)), self._derived)
+        return read_derived(self._mjx_forward(self._data(state)), self._derived, state.qpos.shape[:1])
 
     def _step(self, state: PhysicsState, ctrl: Float[Array, "B nu"]) -> tuple[PhysicsState, Derived, Bool[Array, " B"]]:
         data = self._data(state).replace(ctrl=ctrl)
@@ -90,7 +94,7 @@ class WarpEngine:
         # Velocities diverge once constraint rows are lost, so the task must end these episodes as not finite.
         qpos = jnp.where(lost_rows[:, None], jnp.nan, data.qpos)
         state = PhysicsState(qpos, data.qvel, data.qacc_warmstart)
-        return state, read_derived(data, self._derived), overflow | lost_rows
+        return state, read_derived(data, self._derived, ctrl.shape[:1]), overflow | lost_rows
 
 
 def _over_batch(

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
+from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once, derived_shapes
 
 _WARNING = mujoco.mjtWarning
 _BAD_STATE = [int(_WARNING.mjWARN_BADQPOS), int(_WARNING.mjWARN_BADQVEL), int(_WARNING.mjWARN_BADQACC)]
@@ -34,8 +34,7 @@ class CEngine:
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
         self._model = model
         self._num_substeps = num_substeps
-        blank = mujoco.MjData(model)
-        self._derived_shapes = {name: np.shape(getattr(blank, name)) for name in derived}
+        self._derived_shapes = derived_shapes(model, derived)
         self._num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._workspaces = [mujoco.MjData(model) for _ in range(self._num_threads)]
         self._lock = threading.Lock()

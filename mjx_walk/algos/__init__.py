@@ -3,6 +3,8 @@
 Networks, returns, replay and optimizers that they share are in `mjx_walk.common`; the loop is in `mjx_walk.training`.
 """
 
+import inspect
+import re
 from typing import Any
 
 from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
@@ -10,12 +12,17 @@ from mjx_walk.algos.a2c import A2C, A2CConfig
 from mjx_walk.algos.base import Algorithm, TrainState
 from mjx_walk.algos.csac import CSAC, CSACConfig
 from mjx_walk.algos.ddpg import DDPG, DDPGConfig
+from mjx_walk.algos.off_policy import OffPolicyConfig
+from mjx_walk.algos.on_policy import OnPolicyConfig
 from mjx_walk.algos.ppo import PPO, PPOConfig
 from mjx_walk.algos.reinforce import REINFORCE, REINFORCEConfig
 from mjx_walk.algos.sac import SAC, SACConfig
 from mjx_walk.algos.td3 import TD3, TD3Config
 from mjx_walk.envs import Task
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.envs.registry import identity
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import with_name
 
 ALGORITHMS: dict[str, tuple[type[Algorithm], type]] = {
     "ppo": (PPO, PPOConfig),
@@ -27,7 +34,10 @@ ALGORITHMS: dict[str, tuple[type[Algorithm], type]] = {
     "reinforce": (REINFORCE, REINFORCEConfig),
 }
 
-__all__ = ["ALGORITHMS", "Algorithm", "TrainState", "make_algorithm"]
+BUILT_IN_ALGORITHMS: tuple[str, ...] = tuple(ALGORITHMS)
+"""Names that a user's algorithm cannot take."""
+
+__all__ = ["ALGORITHMS", "BUILT_IN_ALGORITHMS", "Algorithm", "TrainState", "make_algorithm", "register_algorithm"]
 
 
 def make_algorithm(
@@ -46,3 +56,35 @@ def make_algorithm(
         UserError: settings that exclude each other.
     """
     return ALGORITHMS[config.name][0](task, num_envs, evaluation, config, axis_name)
+
+
+def register_algorithm(name: str, algorithm: type[Algorithm], config: type) -> None:
+    """Register an algorithm, so that `algo=NAME` finds it in this process.
+
+    A class with the same module and name replaces a former one, as when a notebook's cell runs again.
+
+    Args:
+        name: lower-case letters, digits and underscores.
+        algorithm: a subclass of `Algorithm`, usually of one of its bases, that defines all abstract methods.
+        config: a dataclass derived from the settings of the base, such as `OnPolicyConfig` or `PPOConfig`.
+
+    Raises:
+        UserError: a name that is taken or invalid, or a class of another kind.
+    """
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise UserError(f"an algorithm cannot be called '{name}'; use lower-case letters, digits and underscores")
+    if name in BUILT_IN_ALGORITHMS:
+        raise UserError(f"'{name}' is an algorithm of this package; choose another name")
+    if not (isinstance(algorithm, type) and issubclass(algorithm, Algorithm)):
+        raise UserError(f"the algorithm '{name}' is {algorithm!r}; give a subclass of mjx_walk.algos.Algorithm")
+    if inspect.isabstract(algorithm):
+        missing = ", ".join(sorted(algorithm.__abstractmethods__))
+        raise UserError(f"the class {algorithm.__name__} of the algorithm '{name}' does not define: {missing}")
+    if not (isinstance(config, type) and issubclass(config, OnPolicyConfig | OffPolicyConfig)):
+        raise UserError(f"the settings of '{name}' are {config!r}; derive them from OnPolicyConfig or OffPolicyConfig")
+    if "__dataclass_fields__" not in vars(config):
+        raise UserError(f"decorate {config.__name__}, the settings of '{name}', with @dataclasses.dataclass")
+    if name in ALGORITHMS and identity(ALGORITHMS[name][0]) != identity(algorithm):
+        known = identity(ALGORITHMS[name][0])
+        raise UserError(f"an algorithm '{name}' is registered already, from {known}; choose another name")
+    ALGORITHMS[name] = (algorithm, with_name(config, name))

@@ -21,17 +21,19 @@ _MAX_PARALLEL_EPISODES = 1024
 """Episodes played at once; an environment takes about 1 MB."""
 
 
-def score_in_gymnasium(task: Task, act: Callable[[np.ndarray], np.ndarray], num_episodes: int, seed: int = 0) -> Scores:
+def score_in_gymnasium(task: Task, act: Callable[[Any], Any], num_episodes: int, seed: int = 0) -> Scores:
     """Score complete episodes in `gymnasium.make`: MuJoCo on the CPU, in float64, with the model's own solver.
 
-    One process per core plays the episodes.
+    One process per core plays the episodes. A task without an equal in Gymnasium is scored in its own engine.
 
     Args:
         task: the environment and its keywords.
-        act: `[N, observation_size] f32 → [N, action_size] f32`, both in Gymnasium's units.
+        act: a JAX function `[N, observation_size] f32 → [N, action_size] f32`, both in Gymnasium's units.
         num_episodes: N.
         seed: episode i is reset with `seed + i`.
     """
+    if not task.is_in_gymnasium:
+        return score_in_sim(task, lambda obs, key: act(obs), num_episodes, seed)
     seeds = [seed + i for i in range(num_episodes)]
     rounds = [seeds[i : i + _MAX_PARALLEL_EPISODES] for i in range(0, num_episodes, _MAX_PARALLEL_EPISODES)]
     returns, lengths = zip(*(_play_in_gymnasium(task, act, some) for some in rounds), strict=True)

@@ -8,7 +8,7 @@ import matplotlib.figure
 import numpy as np
 import scipy.stats
 
-from mjx_walk.envs import TASKS
+from mjx_walk.envs import BUILT_IN_TASKS
 from mjx_walk.experiments import planned_runs
 from mjx_walk.experiments.logged_runs import LoggedRun, group, interval, read_runs
 from mjx_walk.experiments.planned_runs import PlannedRun
@@ -19,7 +19,7 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import replacing, write_text
 from mjx_walk.utils.text import format_score
 
-SUITES = {"mujoco": tuple(TASKS)}
+SUITES = {"mujoco": tuple(BUILT_IN_TASKS)}
 """Environments of each suite."""
 
 REFERENCES = {

@@ -2,7 +2,6 @@
 
 import dataclasses
 import difflib
-import warnings
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,9 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import ENGINES
+from mjx_walk.runs.own_tasks import KEY, find_saved_task, name_task
+from mjx_walk.runs.recipes import CONFIG_DIR, base_recipe, fitting_recipes, recipe_names
+from mjx_walk.runs.renamed import present_overrides, under_present_names
 from mjx_walk.runs.saved_yaml import read_yaml
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import write_text
@@ -36,8 +38,6 @@ __all__ = [
     "compose_config",
     "flatten",
     "load_config",
-    "present_key",
-    "present_overrides",
     "read_config",
     "recipe_names",
     "register_schemas",
@@ -46,24 +46,6 @@ __all__ = [
     "training_command",
     "with_absolute_paths",
 ]
-
-_RENAMED = {
-    "updates_per_chunk": "iterations_per_call",
-    "checkpoint.every_chunks": "checkpoint.every_calls",
-    "algo.updates_per_step": "algo.grad_updates_per_step",
-    "algo.prefill_steps": "algo.learning_starts",
-    "algo.measured_steps": "algo.normalizer_warmup_steps_per_env",
-    "algo.return_bound": "algo.normalized_return_max",
-    "algo.stagger_episodes": "algo.init_at_random_episode_step",
-    "algo.max_unseen": "algo.max_tail_discount",
-    "algo.value_cost": "algo.value_loss_coef",
-    "algo.entropy_cost": "algo.entropy_coef",
-    "algo.mean_bound_cost": "algo.mean_bound_coef",
-}
-"""Present names of settings by their former names. Saved configurations load silently; command lines warn."""
-
-CONFIG_DIR = str(Path(__file__).parents[1] / "configs")
-"""Folder of the Hydra groups and recipes."""
 
 
 @dataclasses.dataclass
@@ -178,14 +160,15 @@ def with_absolute_paths(config: Config, folder: Path) -> Config:
 
 
 def complete_overrides(overrides: list[str]) -> list[str]:
-    """Translate former names, add `hardware=`, and refuse override forms that bypass the schema.
+    """Translate former names, add what follows from others, and refuse override forms that bypass the schema.
 
-    Without `hardware=` the size of the recipe follows from the devices that JAX sees.
+    Without `hardware=` the size of the recipe follows from the devices that JAX sees. `env.task=` runs the file that it
+    names, and gives `env=`. A task or an algorithm of a user without `recipe=` gets that of `base_recipe`.
 
     Raises:
         UserError: `+key`, `++key` or `~key`, a malformed override, or an unknown environment or algorithm.
     """
-    overrides = present_overrides(overrides)
+    overrides = _with_named_task(present_overrides(overrides))
     try:
         parsed = OverridesParser.create().parse_overrides(overrides)
     except HydraException as error:
@@ -202,23 +185,29 @@ def complete_overrides(overrides: list[str]) -> list[str]:
     overrides = [_as_text(override) for override in parsed]
     if not any(override.key_or_group == "hardware" for override in parsed):
         overrides = [f"hardware={'cpu' if jax.default_backend() == 'cpu' else 'gpu'}", *overrides]
-    return overrides
+    return _with_recipe(overrides)
 
 
-def present_key(key: str) -> str:
-    """The present name of a setting."""
-    return _RENAMED.get(key, key)
+def _with_named_task(overrides: list[str]) -> list[str]:
+    """Overrides with `env=` for the task that `env.task=` names, whose file runs here."""
+    sources = [override.partition("=")[2] for override in overrides if override.partition("=")[0] == KEY]
+    if not sources:
+        return overrides
+    name, source = name_task(sources[-1])
+    rest = [override for override in overrides if override.partition("=")[0] != KEY and override != f"env={name}"]
+    for override in rest:
+        if override.partition("=")[0] == "env":
+            raise UserError(f"give {override} or {KEY}={source}, not both")
+    return [f"env={name}", *rest, f"{KEY}={source}"]
 
 
-def present_overrides(overrides: list[str]) -> list[str]:
-    """Overrides under the present names of their settings. A former name warns."""
-    present = []
-    for override in overrides:
-        key, equals, value = override.partition("=")
-        if key in _RENAMED:
-            warnings.warn(f"{key} is now {_RENAMED[key]}; the former name still works", stacklevel=2)
-        present.append(present_key(key) + equals + value)
-    return present
+def _with_recipe(overrides: list[str]) -> list[str]:
+    """Overrides with the recipe for a task or an algorithm of a user, unless one is given."""
+    given = {"env": "humanoid", "algo": "ppo"} | dict(override.split("=", 1) for override in overrides)
+    if "recipe" in given or given["env"] not in TASKS or given["algo"] not in ALGORITHMS:  # a sweep has several
+        return overrides
+    recipe = base_recipe(given["env"], given["algo"], given["hardware"])
+    return [*overrides, f"recipe={recipe}"] if recipe else overrides
 
 
 def _as_text(override: Override) -> str:
@@ -254,7 +243,10 @@ def read_config(path: Path) -> Config:
         UserError: the file is not a configuration that this version reads.
     """
     try:
-        saved = _under_present_names(read_yaml(path))
+        saved = under_present_names(read_yaml(path))
+        find_saved_task(saved.env.name, saved.env.get("task"), path)
+        if saved.algo.name not in ALGORITHMS:
+            raise UserError(f"the algorithm '{saved.algo.name}' of {path} is not known here; {_HOW_TO_REGISTER}")
         schema = OmegaConf.structured(Config(env=TASKS[saved.env.name][1](), algo=ALGORITHMS[saved.algo.name][1]()))
         return to_config(OmegaConf.merge(schema, saved))
     except UserError:
@@ -263,20 +255,11 @@ def read_config(path: Path) -> Config:
         raise UserError(f"{path} is not a configuration of this version: {_first_line(error)}") from error
 
 
+_HOW_TO_REGISTER = "call mjx_walk.register_algorithm before load_run, or in the FILE.py of env.task=FILE.py:CLASS"
 _UNREADABLE = (
     *(LookupError, AttributeError, TypeError, ValueError, RecursionError),
     *(yaml.YAMLError, OmegaConfBaseException),
 )
-
-
-def _under_present_names(saved: Any) -> Any:
-    """Move the renamed settings of a saved configuration to their present names."""
-    for old, new in _RENAMED.items():
-        section, _, name = old.rpartition(".")
-        node = OmegaConf.select(saved, section) if section else saved
-        if node is not None and name in node:
-            node[new.rpartition(".")[2]] = node.pop(name)
-    return saved
 
 
 def _first_line(error: BaseException) -> str:
@@ -301,24 +284,11 @@ def _one_line(error: BaseException, overrides: list[str]) -> str:
             choices = near or [key for key in valid if key.rpartition(".")[0] == section] or valid
             return f"unknown key '{unknown[0]}'; did you mean: {', '.join(choices)}?"
     if "Could not find 'recipe/" in texts[0]:
-        return f"{_first_line(error)}; {_fitting_recipes(overrides)}"
+        chosen = dict(override.split("=", 1) for override in overrides if override.startswith(("env=", "algo=")))
+        return f"{_first_line(error)}; {fitting_recipes(chosen.get('env', 'humanoid'), chosen.get('algo', 'ppo'))}"
     key = getattr(error, "full_key", None) or getattr(error.__cause__, "full_key", None)
     detail = _first_line(error.__cause__ or error)
     return f"{key}: {detail}" if key else detail
-
-
-def _fitting_recipes(overrides: list[str]) -> str:
-    """The recipes for the given, or the default, environment and algorithm."""
-    given = dict(override.split("=", 1) for override in overrides if override.startswith(("env=", "algo=")))
-    task = {"env": "humanoid", "algo": "ppo"} | given
-    names = [name for name in recipe_names() if name.endswith(f"/{task['env']}_{task['algo']}")]
-    return f"recipes for env={task['env']} algo={task['algo']}: {', '.join(names)}"
-
-
-def recipe_names() -> list[str]:
-    """Valid values of `recipe=`, such as `cpu/humanoid_ppo`."""
-    folder = Path(CONFIG_DIR) / "recipe"
-    return sorted(str(path.relative_to(folder).with_suffix("")) for path in folder.glob("**/[!_]*.yaml"))
 
 
 def training_command(config: Config) -> str:

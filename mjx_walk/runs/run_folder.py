@@ -146,8 +146,12 @@ def _check(folder: RunFolder, config: Config) -> None:
         return
     saved = read_config(open_existing(folder.path).config)
     differing = differences(saved, config)
-    if _name_same_function(saved.env.reward_function, config.env.reward_function):  # which may have moved
-        differing = [text for text in differing if not text.startswith("env.reward_function ")]
+    moved = []  # files that may have moved; a task may also have come from Python
+    if _name_same(saved.env.reward_function, config.env.reward_function):
+        moved.append("env.reward_function ")
+    if not (saved.env.task and config.env.task) or _name_same(saved.env.task, config.env.task):
+        moved.append("env.task ")
+    differing = [text for text in differing if not text.startswith(tuple(moved))]
     if differing:
         raise UserError(f"resume=true with another configuration than {folder.config}: {'; '.join(differing)}")
     if folder.gymnasium_scores.exists() and not list_steps(folder.checkpoints):
@@ -156,8 +160,8 @@ def _check(folder: RunFolder, config: Config) -> None:
         raise UserError(f"total_steps={config.total_steps} is below this run's {saved.total_steps}; it may only grow")
 
 
-def _name_same_function(source: str | None, other: str | None) -> bool:
-    """Whether two `PATH.py:FUNCTION` differ at most in the folder of the file."""
+def _name_same(source: str | None, other: str | None) -> bool:
+    """Whether two `PATH.py:NAME` differ at most in the folder of the file."""
     return bool(source and other) and Path(str(source)).name == Path(str(other)).name
 
 

@@ -1,4 +1,4 @@
-"""The user's own list of reward functions that may run without being named again.
+"""The user's own list of reward functions and tasks that may run without being named again.
 
 It stands outside any run folder: a downloaded folder cannot bring its own entries.
 """
@@ -20,7 +20,7 @@ __all__ = ["remember", "require_trusted", "trust_file"]
 _LOGGER = logging.getLogger(__name__)
 
 Trusted = dict[str, dict[str, str]]
-"""For each `PATH.py:FUNCTION`, the SHA-256 of the file and of its helpers, by absolute path."""
+"""For each `PATH.py:NAME`, the SHA-256 of the file and of its helpers, by absolute path."""
 
 
 def trust_file() -> Path:
@@ -30,12 +30,13 @@ def trust_file() -> Path:
     return folder / "mjx_walk" / "trusted_reward_functions.json"
 
 
-def remember(source: str, hashes: Mapping[str, str]) -> None:
-    """Note a reward function that the user has named. A list that cannot be read or written only warns.
+def remember(source: str, hashes: Mapping[str, str], key: str = "env.reward_function") -> None:
+    """Note a reward function or task that the user has named. A list that cannot be read or written only warns.
 
     Args:
-        source: absolute `PATH.py:FUNCTION`.
+        source: absolute `PATH.py:NAME`.
         hashes: SHA-256 of the file and of its helpers, by absolute path.
+        key: the setting that names it, for messages.
     """
     trusted = _read()
     if trusted is None or trusted.get(source) == hashes:
@@ -46,31 +47,32 @@ def remember(source: str, hashes: Mapping[str, str]) -> None:
         write_text(path, json.dumps(trusted | {source: dict(hashes)}, indent=1), mode=0o600)
     except (OSError, UserError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        _LOGGER.warning("%s cannot be written (%s); a resume needs %s", path, reason, _named(source))
+        _LOGGER.warning("%s cannot be written (%s); a resume needs %s", path, reason, _named(key, source))
 
 
-def require_trusted(source: str) -> None:
-    """Check that the user has named a reward function before, and that its files are the same.
+def require_trusted(source: str, key: str = "env.reward_function") -> None:
+    """Check that the user has named a reward function or task before, and that its files are the same.
 
     This process then runs only these files for it.
 
     Args:
-        source: `PATH.py:FUNCTION` of a saved configuration.
+        source: `PATH.py:NAME` of a saved configuration.
+        key: the setting that names it, for messages.
 
     Raises:
         UserError: the user has not named it, or a file has changed; the message says what to type.
     """
     hashes = (_read() or {}).get(source)
     if hashes is None or not os.path.isabs(source):
-        raise UserError(f"the saved run uses the code of {source}; to run it, add {_named(source)}")
+        raise UserError(f"the saved run uses the code of {source}; to run it, add {_named(key, source)}")
     changed = changed_file(hashes)
     if changed:
-        raise UserError(f"{changed} has changed since you named it; to run it as it is now, add {_named(source)}")
+        raise UserError(f"{changed} has changed since you named it; to run it as it is now, add {_named(key, source)}")
     only_known(reward_path(source), hashes)
 
 
-def _named(source: str) -> str:
-    return shlex.quote(f"env.reward_function={source}")
+def _named(key: str, source: str) -> str:
+    return shlex.quote(f"{key}={source}")
 
 
 def _read() -> Trusted | None:
@@ -88,7 +90,7 @@ def _read() -> Trusted | None:
         reason = "it is not a list of reward functions"
     if _is_trusted(content):
         return content
-    _LOGGER.warning("%s is ignored (%s); remove it, or name the reward function at each resume", path, reason)
+    _LOGGER.warning("%s is ignored (%s); remove it, or name the file each time", path, reason)
     return None
 
 

@@ -144,7 +144,8 @@ class Trainer:
         num_episodes = self.config.evaluation.gymnasium_episodes
         is_main = self._processes.is_main_process
         if num_episodes and is_main:
-            _log.info("Scoring %d episodes of each policy in Gymnasium, on the CPU", num_episodes)
+            where = "Gymnasium, on the CPU" if self._task.is_in_gymnasium else f"physics={self._task.engine.name}"
+            _log.info("Scoring %d episodes of each policy in %s", num_episodes, where)
         try:
             for recorder in self.recorders:
                 seed = recorder.config.seed if len(self.recorders) > 1 else None

@@ -3,12 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["AnyBut", "describe", "has_effect", "refuse_ineffective", "setting", "validate"]
+__all__ = ["AnyBut", "describe", "has_effect", "refuse_ineffective", "setting", "validate", "with_name"]
 
+Schema = TypeVar("Schema")
 
 _MAX_INT = 10**12
 """No count is larger. JAX cannot hold shapes from 2**63 elements on, and some of its errors end the process."""
@@ -45,6 +46,17 @@ def setting(
     limits = {"above": above, "at_least": at_least, "at_most": at_most, "below": below, "choices": choices}
     metadata = {k: v for k, v in (limits | {"only_if": only_if}).items() if v is not None}
     return dataclasses.field(default=default, metadata=metadata)
+
+
+def with_name(schema: type[Schema], name: str) -> type[Schema]:
+    """A subclass of a dataclass whose field `name` has one valid value.
+
+    Args:
+        schema: dataclass whose fields have defaults.
+        name: the value.
+    """
+    field = ("name", str, setting(name, choices=(name,)))
+    return dataclasses.make_dataclass(schema.__name__, [field], bases=(schema,))
 
 
 def validate(config: Any, prefix: str = "") -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from mjx_walk.envs import Task, View
 from mjx_walk.utils.quiet_mujoco import hide_deprecations
 from mjx_walk.viewing.rendering import choose_opengl
+from mjx_walk.viewing.task_env import TaskEnv
 
 _FLOOR_SCALE = 20.0
 """MuJoCo draws a plane only as large as its `size`; a fast runner leaves it after 3 seconds."""
@@ -67,7 +68,7 @@ def record_episode(
     size: tuple[int, int] | None = None,
     frame_rate: float = 30.0,
 ) -> Episode:
-    """Play one episode in `gymnasium.make`.
+    """Play one episode in the real Gymnasium, or in the task's own engine if Gymnasium has no equal.
 
     Args:
         task: the environment and its keywords.
@@ -92,7 +93,7 @@ def record_episode(
         obs, reward, terminated, truncated, info = env.step(policy(obs))
         is_over = terminated or truncated
         kept["qpos"].append(data.qpos.copy())
-        kept["body"].append(data.xpos[task.VIEW.body].copy())
+        kept["body"].append(data.xpos[task.view.body].copy())
         kept["motor_forces"].append(data.actuator_force * model.actuator_gear[:, 0])
         kept["floor_contacts"].append(_floor_contacts(model, data))
         kept["rewards"].append(float(reward))
@@ -106,7 +107,7 @@ def record_episode(
         env=task.gymnasium_id,
         model=model,
         seconds_per_step=inner.dt,
-        view=task.VIEW,
+        view=task.view,
         reward_terms={name: np.array(values) for name, values in terms.items()},
         frames=frames,
         steps_per_frame=steps_per_frame,
@@ -115,7 +116,12 @@ def record_episode(
 
 
 def make_gymnasium(task: Task, **keywords: Any) -> gymnasium.Env:
-    """Make the real Gymnasium environment of a task, with further keywords of `gymnasium.make`."""
+    """Make the real Gymnasium environment of a task, with further keywords of `gymnasium.make`.
+
+    A task without an equal in Gymnasium runs in its own engine.
+    """
+    if not task.is_in_gymnasium:
+        return TaskEnv(task, **keywords)
     options = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
     with hide_deprecations(), warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
@@ -140,7 +146,7 @@ def _make_rendered(task: Task, width: int, height: int) -> gymnasium.Env:
     env = make_gymnasium(task, render_mode="rgb_array", width=width, height=height)
     inner: Any = env.unwrapped
     model = inner.model
-    inner.mujoco_renderer.default_cam_config = camera_settings(task.VIEW)
+    inner.mujoco_renderer.default_cam_config = camera_settings(task.view)
     inner.mujoco_renderer.camera_id = None  # a camera id would stop the camera from following
     is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     model.geom_size[is_plane, :2] *= _FLOOR_SCALE

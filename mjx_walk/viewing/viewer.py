@@ -36,7 +36,7 @@ def show(task: Task, policy: Callable[[np.ndarray], np.ndarray], seed: int = 0) 
         hint = "on macOS run it with mjpython instead of python" if sys.platform == "darwin" else str(error)
         raise UserError(f"the viewer could not be opened: {hint}") from error
     with window:
-        for name, value in camera_settings(task.VIEW).items():
+        for name, value in camera_settings(task.view).items():
             setattr(window.cam, name, value)
         is_over = True
         while window.is_running():

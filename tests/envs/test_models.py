@@ -1,0 +1,129 @@
+"""Models from elsewhere: each equals Gymnasium's class under the same file, or is refused in one line."""
+
+import importlib.util
+from pathlib import Path
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from helpers import CLONE, TINY, train_here
+
+from mjx_walk.envs import TASKS, make_env
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.quiet_mujoco import hide_deprecations
+
+FOLDERS = {
+    "Gymnasium": ("gymnasium", "envs/mujoco/assets"),
+    "Brax": ("brax", "envs/assets"),
+    "dm_control": ("dm_control", "suite"),
+}
+EQUAL = "equals Gymnasium"
+STATE = "motors with a state of their own"
+MODELS = [
+    ("Brax humanoid.xml", "humanoid", EQUAL),
+    ("Brax ant.xml", "ant", EQUAL),
+    ("Brax half_cheetah.xml", "half_cheetah", EQUAL),
+    ("Brax walker2d.xml", "walker2d", EQUAL),
+    ("Brax pusher.xml", "pusher", EQUAL),
+    ("Brax inverted_double_pendulum.xml", "inverted_double_pendulum", EQUAL),
+    ("dm_control humanoid.xml", "humanoid", EQUAL),
+    ("dm_control humanoid.xml", "ant", EQUAL),
+    ("dm_control walker.xml", "walker2d", EQUAL),
+    ("dm_control cheetah.xml", "half_cheetah", EQUAL),
+    ("dm_control hopper.xml", "hopper", EQUAL),
+    ("dm_control swimmer.xml", "swimmer", "this one has no <actuator>"),
+    ("dm_control quadruped.xml", "ant", STATE),
+    ("dm_control dog.xml", "ant", STATE),
+    ("Gymnasium ant.xml", "walker2d", EQUAL),
+    ("Gymnasium humanoid.xml", "ant", EQUAL),
+    ("Gymnasium point.xml", "ant", EQUAL),
+    ("Gymnasium hopper.xml", "reacher", "the model has no body 'fingertip'"),
+    ("Gymnasium ant.xml", "pusher", "the model has no body 'tips_arm'"),
+    ("Gymnasium inverted_pendulum.xml", "humanoid", "at least 3 positions (nq); this one has 2"),
+    ("Gymnasium walker2d_v5.xml", "inverted_double_pendulum", "at least 1 site(s); this one has 0"),
+]
+"""Model, task, and the result: `EQUAL`, or a part of the error."""
+
+
+def path_of(model):
+    """The file of a model in its installed package."""
+    library, file = model.split()
+    package, folder = FOLDERS[library]
+    spec = importlib.util.find_spec(package)
+    if spec is None:
+        pytest.skip(f"{package} is not installed: pip install --no-deps {package}")
+    return Path(spec.submodule_search_locations[0]) / folder / file
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("model", "name", "result"), MODELS)
+def test_equal_to_gymnasium_or_refused(model, name, result):
+    path = str(path_of(model))
+    if result != EQUAL:
+        with pytest.raises(UserError) as refused:
+            make_env(name, physics="c", xml_file=path)
+        assert result in str(refused.value) and "\n" not in str(refused.value)
+        return
+    task = make_env(name, physics="c", xml_file=path)
+    with hide_deprecations():
+        real = gymnasium.make(task.gymnasium_id, xml_file=path).unwrapped
+    real.reset(seed=0)
+    qpos, qvel = np.float32(real.data.qpos), np.float32(real.data.qvel)
+    real.set_state(np.float64(qpos), np.float64(qvel))
+    real.data.qacc_warmstart[:] = 0
+    state = task.reset_to(qpos, qvel)
+    np.testing.assert_allclose(state.obs, real._get_obs(), rtol=1e-6, atol=1e-6)
+    action = np.random.default_rng(0).uniform(1.2 * task.action_low, 1.2 * task.action_high)
+    obs, reward, terminated, _, _ = real.step(np.float32(action))
+    state = jax.jit(task.step)(state, np.float32(action))
+    np.testing.assert_allclose(state.obs, obs, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(state.reward, reward, rtol=1e-5, atol=1e-4)
+    assert bool(state.terminated) == terminated
+    assert jax.eval_shape(task.reset, jax.random.PRNGKey(0)).obs.shape == (task.observation_size,)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "name"), [(model, name) for model, name, result in MODELS if result == EQUAL])
+def test_trains(model, name, tmp_path):
+    train_here(tmp_path, f"env={name}", f"env.xml_file={path_of(model)}", "total_steps=128", tiny=TINY[1:])
+
+
+def test_the_page_shows_this_table():
+    rows = [line for line in (CLONE / "docs" / "your_own.md").read_text().splitlines() if line.startswith("| ")]
+    shown = [tuple(cell.strip(" `") for cell in row.strip("|").split("|")) for row in rows]
+    for model, name, result in MODELS:
+        library, file = model.split()
+        (said,) = (row[3] for row in shown if row[:3] == (library, file, name))
+        said = said.replace("&lt;", "<").replace("&gt;", ">")
+        assert said == result if result == EQUAL else said.startswith("refused: ") and result in said, (model, name)
+
+
+def edited(tmp_path, old, new):
+    """Gymnasium's walker2d with a change."""
+    text = path_of("Gymnasium walker2d_v5.xml").read_text()
+    assert old in text
+    (tmp_path / "edited.xml").write_text(text.replace(old, new))
+    return str(tmp_path / "edited.xml")
+
+
+def test_motors_without_a_range_are_refused(tmp_path):
+    source = 'ctrllimited="true" ctrlrange="-1.0 1.0" gear="100" joint="leg_joint"'
+    path = edited(tmp_path, source, 'gear="100" name="shin" joint="leg_joint"')
+    with pytest.raises(UserError, match="motor 'shin' of the model has no range of controls; give it ctrlrange"):
+        make_env("walker2d", physics="c", xml_file=path)
+
+
+@pytest.mark.parametrize(
+    ("shaping", "says"),
+    [({"backward": 1.0}, "has no x coordinate"), ({"keep_y": 1.0}, "has no y coordinate")],
+)
+def test_shaping_needs_the_coordinate_in_the_model(shaping, says):
+    """Ant reads qpos[0] and qpos[1] as x and y, which they are not in a model whose root turns first."""
+    make_env("ant", physics="c", shaping=shaping)
+    with pytest.raises(UserError, match=says):
+        make_env("ant", physics="c", shaping=shaping, xml_file="pusher_v5.xml", main_body=1)
+
+
+def test_the_view_fits_the_model():
+    assert all(make_env(name, physics="c").view == TASKS[name][0].VIEW for name in TASKS)

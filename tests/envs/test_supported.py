@@ -1,0 +1,194 @@
+"""Every feature of a model is simulated as by the `c` engine, or refused by the name of the element."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_walk.envs.physics import PhysicsState, make_engine
+from mjx_walk.utils.errors import UserError
+
+PARTS = {
+    **dict.fromkeys(("option", "flag", "custom", "asset", "floor", "knee", "shin", "world"), ""),
+    **dict.fromkeys(("contact", "tendon", "equality", "sensor"), ""),
+    "torso": 'type="capsule" size=".05" fromto="-.15 0 0 .15 0 0"',
+    "motor": '<motor name="m" joint="knee" gear="2" ctrlrange="-1 1"/>',
+}
+MODEL = """
+<mujoco>
+  <option timestep="0.004" {option}>{flag}</option>
+  <custom>{custom}</custom>
+  <asset>{asset}</asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 .1" {floor}/>
+    <body pos="0 0 .045">
+      <joint name="slide" type="slide" axis="1 0 0"/>
+      <joint name="lift" type="slide" axis="0 0 1"/>
+      <joint name="hinge" axis="0 1 0"/>
+      <geom name="torso" {torso}/>
+      <site name="back" pos="0 0 .1"/>
+      <body name="shin" pos=".3 0 0">
+        <joint name="knee" axis="0 1 0" {knee}/>
+        <geom name="shin" type="capsule" size=".04" fromto="0 0 0 .3 0 .05" {shin}/>
+        <site name="tip" pos=".3 0 .05"/>
+      </body>
+    </body>
+    {world}
+  </worldbody>
+  <contact>{contact}</contact>
+  <tendon>{tendon}</tendon>
+  <equality>{equality}</equality>
+  <actuator>{motor}</actuator>
+  <sensor>{sensor}</sensor>
+</mujoco>
+"""
+MOTOR = '<motor name="m" joint="knee" gear="2" ctrlrange="-1 1" {}/>'
+GENERAL = '<general name="m" joint="knee" ctrlrange="-1 1" {}/>'
+FIXED = '<fixed name="t" {}><joint joint="hinge" coef="1"/><joint joint="knee" coef="-.7"/></fixed>'
+SPATIAL = '<spatial name="t" {}><site site="back"/><site site="tip"/></spatial>'
+SPHERE = 'type="sphere" size=".05"'
+ALL, MJX, JAX, WARP = ("c", "jax", "warp"), ("jax", "warp"), ("jax",), ("warp",)
+
+REFUSED = {
+    "filter": (ALL, {"motor": GENERAL.format('dyntype="filter" dynprm=".05"')}, "state of their own (motor 'm')"),
+    "integrator": (ALL, {"motor": GENERAL.format('dyntype="integrator"')}, "state of their own (motor 'm')"),
+    "delay": (ALL, {"motor": MOTOR.format('delay=".01" nsample="4"')}, "motors with a delay (motor 'm')"),
+    "sensor_delay": (
+        ALL,
+        {"sensor": '<jointpos name="s" joint="knee" delay=".01" nsample="4"/>'},
+        "sensors with a history (sensor 's')",
+    ),
+    "sleep": (ALL, {"flag": '<flag sleep="enable"/>'}, 'sleeping bodies (<flag sleep="enable"/>)'),
+    "implicit": (ALL, {"option": 'integrator="implicit"'}, "integrator 'implicit' is not supported"),
+    "group": (
+        MJX,
+        {"option": 'actuatorgroupdisable="2"', "motor": MOTOR.format('group="2"')},
+        "disabled groups of motors (motor 'm')",
+    ),
+    "armature": (MJX, {"motor": MOTOR.format('armature=".2"')}, "the armature of motors (motor 'm')"),
+    "connect": (MJX, {"equality": '<connect name="e" body1="shin" anchor=".3 0 0"/>'}, "(equality constraint 'e')"),
+    "weld": (MJX, {"equality": '<weld body1="shin"/>'}, "weld constraints as MuJoCo does (equality constraint 0)"),
+    "override": (MJX, {"option": 'o_margin=".02"', "flag": '<flag override="enable"/>'}, "does not support this model"),
+    "diagexact": (MJX, {"flag": '<flag diagexact="enable"/>'}, "does not support this model"),
+    "autoreset": (WARP, {"flag": '<flag autoreset="disable"/>'}, "does not support this model"),
+    "damping": (JAX, {"motor": MOTOR.format('damping=".2"')}, "the damping of motors (motor 'm')"),
+    "dampingpoly": (JAX, {"knee": 'damping=".1 .2 .05"'}, "stiffness and damping (joint 'knee')"),
+    "stiffnesspoly": (JAX, {"knee": 'stiffness="1 5 3"'}, "stiffness and damping (joint 'knee')"),
+    "tendonpoly": (JAX, {"tendon": SPATIAL.format('damping="1 .5 .5"')}, "stiffness and damping (tendon 't')"),
+    "adhesion": (JAX, {"torso": f'{SPHERE} adhesion="4"'}, "adhesion (geom 'torso')"),
+    "surfacevel": (JAX, {"floor": 'surfacevel="1 0 0 0 0 0"'}, "moving surfaces (geom 'floor')"),
+    "ellipsoid_fluid": (
+        JAX,
+        {"option": 'density="500" viscosity=".5"', "shin": 'fluidshape="ellipsoid"'},
+        "the fluid forces of single geoms (geom 'shin')",
+    ),
+    "noslip": (JAX, {"option": 'noslip_iterations="5"'}, "the noslip solver (noslip_iterations)"),
+    "slidercrank": (
+        JAX,
+        {"motor": '<general cranksite="back" slidersite="tip" cranklength=".4" ctrlrange="-1 1"/>'},
+        "does not support this model",
+    ),
+    "adhesion_motor": (JAX, {"motor": '<adhesion body="shin" ctrlrange="0 1" gain="5"/>'}, "does not support"),
+    "cylinder_box": (
+        JAX,
+        {"torso": 'type="cylinder" size=".1 .05"', "world": '<geom type="box" size=".1 .1 .02" pos=".05 0 0"/>'},
+        "collisions not implemented",
+    ),
+}
+"""For each feature: the engines that refuse it, the model's parts, and what the error says."""
+
+SIMULATED = {
+    "plain": {},
+    "rk4": {"option": 'integrator="RK4"'},
+    "elliptic": {"option": 'cone="elliptic" impratio="10"'},
+    "cg": {"option": 'solver="CG" iterations="50"'},
+    "pgs": {"option": 'solver="PGS" iterations="200"'},
+    "condim1": {"torso": f'{SPHERE} condim="1"'},
+    "condim6": {"torso": f'{SPHERE} condim="6"'},
+    "margin": {"torso": f'{SPHERE} margin=".05" gap=".02"'},
+    "pair": {"torso": SPHERE, "contact": '<pair geom1="floor" geom2="torso" friction=".1 .1 .1 .1 .1" condim="6"/>'},
+    "max_contact_points": {"custom": '<numeric name="max_contact_points" data="1"/>'},
+    "frictionloss": {"knee": 'frictionloss=".3"'},
+    "springdamper": {"knee": 'springdamper=".1 1"'},
+    "actuatorfrcrange": {"knee": 'actuatorfrcrange="-.5 .5"'},
+    "forcerange": {"motor": MOTOR.format('forcerange="-.3 .3"')},
+    "position": {"motor": '<position joint="knee" kp="5" kv="1" ctrlrange="-1 1"/>'},
+    "velocity": {"motor": '<velocity joint="knee" kv="1" ctrlrange="-1 1"/>'},
+    "site_motor": {"motor": '<motor site="tip" refsite="back" gear="0 0 1 0 0 0" ctrlrange="-1 1"/>'},
+    "tendon_motor": {
+        "tendon": FIXED.format('actuatorfrcrange="-.2 .2"'),
+        "motor": '<motor tendon="t" ctrlrange="-1 1"/>',
+    },
+    "tendon_spring": {"tendon": SPATIAL.format('stiffness="10" springlength=".1 .2" damping="1" armature=".5"')},
+    "tendon_limit": {"tendon": SPATIAL.format('range="0 .3" limited="true" frictionloss=".1"')},
+    "tendon_equality": {"tendon": FIXED.format(""), "equality": '<tendon tendon1="t"/>'},
+    "joint_equality": {"equality": '<joint joint1="hinge" joint2="knee" polycoef="0 .5 1 .5 0"/>'},
+    "inactive_weld": {"equality": '<weld body1="shin" active="false"/>'},
+    "mocap": {"world": '<body mocap="true" pos=".3 0 .1"><geom type="sphere" size=".08"/></body>'},
+    "wind": {"option": 'density="5" viscosity=".5" wind="3 0 0"'},
+    "no_filterparent": {"flag": '<flag filterparent="disable"/>'},
+    "no_clampctrl": {"flag": '<flag clampctrl="disable"/>'},
+    "no_eulerdamp": {"flag": '<flag eulerdamp="disable"/>', "knee": 'damping="1"'},
+    "no_refsafe": {"flag": '<flag refsafe="disable"/>', "torso": f'{SPHERE} solref=".004 1"'},
+    "no_warmstart": {"flag": '<flag warmstart="disable"/>'},
+}
+"""Parts of models that every engine simulates."""
+
+
+def load(parts):
+    return mujoco.MjModel.from_xml_string(MODEL.format(**PARTS | parts))
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refused_by_name(name):
+    engines, parts, says = REFUSED[name]
+    for engine in engines:
+        with pytest.raises(UserError) as refused:
+            make_engine(engine, load(parts), 1, ())
+        assert says in str(refused.value) and "\n" not in str(refused.value)
+    if "c" not in engines:
+        make_engine("c", load(parts), 1, ())
+
+
+def visited(model, num_envs=8, num_steps=10):
+    """States on trajectories of the `c` engine under random controls, and the controls."""
+    rng = np.random.default_rng(0)
+    qpos = model.qpos0 + 0.02 * rng.normal(size=(num_envs, model.nq))
+    qvel = 0.5 * rng.normal(size=(num_envs, model.nv))
+    state = PhysicsState(jnp.float32(qpos), jnp.float32(qvel), jnp.zeros((num_envs, model.nv)))
+    step = jax.jit(jax.vmap(make_engine("c", model, 3, ()).step))
+    states, controls = [], []
+    for _ in range(num_steps):
+        states.append(state)
+        controls.append(jnp.float32(rng.uniform(-2, 2, (num_envs, model.nu))))
+        state = step(state, controls[-1])[0]
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *states), jnp.concatenate(controls)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", MJX)
+@pytest.mark.parametrize("name", SIMULATED)
+def test_simulated_as_by_the_c_engine(name, engine):
+    model = load(SIMULATED[name])
+    states, controls = visited(model)
+    expected, found = (
+        np.asarray(jax.jit(jax.vmap(make_engine(one, model, 1, ()).step))(states, controls)[0].qvel)
+        for one in ("c", engine)
+    )
+    change = np.abs(expected - states.qvel).max(axis=1)
+    errors = np.abs(found - expected).max(axis=1) / (1 + change)
+    assert np.median(change) > 1e-2
+    assert np.quantile(errors, 0.9) < 5e-4
+
+
+def test_environments_of_the_c_engine_do_not_share_a_state():
+    """A resting environment stays the same, whatever its neighbor does."""
+    model = load({"world": SIMULATED["mocap"]["world"], "equality": '<weld body1="shin" active="true"/>'})
+    step = jax.jit(jax.vmap(make_engine("c", model, 1, ()).step))
+    state = PhysicsState(*(jnp.tile(jnp.float32(x), (2, 1)) for x in (model.qpos0, np.zeros(4), np.zeros(4))))
+    alone, acting = state, state
+    for _ in range(5):
+        alone, acting = step(alone, jnp.zeros((2, 1)))[0], step(acting, jnp.float32([[0.0], [1.0]]))[0]
+    np.testing.assert_array_equal(alone.qvel[0], acting.qvel[0])
+    assert (acting.qvel[0] != acting.qvel[1]).any()
