@@ -9,16 +9,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs import models
 from mjx_walk.envs.info import GymnasiumInfo
-from mjx_walk.envs.models import (
-    ModelNeeds,
-    body_id,
-    check_model,
-    is_coordinate,
-    load_model,
-    motor_dofs,
-    warn_of_coordinates,
-)
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_files import load_reward_function
@@ -28,7 +20,7 @@ from mjx_walk.envs.task_options import TaskOptions, check_version
 from mjx_walk.envs.view import View
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["MAX_ABS_VALUE", "Task", "View"]
+__all__ = ["MAX_ABS_VALUE", "Task"]
 
 MAX_ABS_VALUE = 1e10
 """Largest valid position or velocity, as in MuJoCo's own check (`mjMAXVAL`)."""
@@ -52,7 +44,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     """Env options that Gymnasium's v5 class does not take."""
     MISSING_VERSIONS: dict[str, str] = {}
     """Why a version is not available, by version."""
-    MODEL_NEEDS: ModelNeeds = ModelNeeds()
+    MODEL_NEEDS: models.ModelNeeds = models.ModelNeeds()
     """What the task reads of a model by index."""
     HAS_X: bool = True
     """Whether `qpos[0]` is the root's forward coordinate x."""
@@ -79,11 +71,11 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         check_version(options, self.XML_FILES, self.MISSING_VERSIONS, {"v5": self.V5_ONLY, "v4": self.V4_ONLY})
         self.options = options
         self.max_episode_steps = options.max_episode_steps
-        self.model = load_model(options.xml_file or self.XML_FILES[options.version])
-        self.body_ids = {body: body_id(self.model, body) for body in self.named_bodies()}
-        check_model(self.model, options.name, self.MODEL_NEEDS)
+        self.model = models.load_model(options.xml_file or self.XML_FILES[options.version])
+        self.body_ids = {body: models.body_id(self.model, body) for body in self.named_bodies()}
+        models.check_model(self.model, options.name, self.MODEL_NEEDS)
         if options.xml_file:
-            warn_of_coordinates(self.model, options.name, self.HAS_X, self.HEIGHT_INDEX)
+            models.warn_of_coordinates(self.model, options.name, self.HAS_X, self.HEIGHT_INDEX)
         self.view = self.VIEW._replace(body=min(self.VIEW.body, self.model.nbody - 1))
         self.dt = self.model.opt.timestep * options.frame_skip
         self.kept_arrays = self.info_arrays() if keep_info else ()
@@ -95,7 +87,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         self.init_qpos = jnp.asarray(self.model.qpos0, jnp.float32)
         self.init_qvel = jnp.zeros(self.model.nv, jnp.float32)
         self.observation_size = sum(self.observation_blocks().values())
-        self._motor_dofs = motor_dofs(self.model)
+        self._motor_dofs = models.motor_dofs(self.model)
         self._check_shaping()
         self._reward_function = load_reward_function(options.reward_function) if options.reward_function else None
         self.reward_terms = self._reward_term_names()
@@ -107,9 +99,9 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 
     def _check_shaping(self) -> None:
         name, shaping = self.options.name, self.options.shaping
-        if shaping.backward and not (self.HAS_X and is_coordinate(self.model, 0, axis=0)):
+        if shaping.backward and not (self.HAS_X and models.is_coordinate(self.model, 0, axis=0)):
             raise UserError(f"env.shaping.backward={shaping.backward}: {name} has no x coordinate; set it to 0")
-        if shaping.keep_y and not (self.HAS_Y and is_coordinate(self.model, 1, axis=1)):
+        if shaping.keep_y and not (self.HAS_Y and models.is_coordinate(self.model, 1, axis=1)):
             raise UserError(f"env.shaping.keep_y={shaping.keep_y}: {name} has no y coordinate; set it to 0")
         if shaping.shaking and not self._motor_dofs.size:
             raise UserError(f"env.shaping.shaking={shaping.shaking}: no motor drives a joint; set it to 0")
