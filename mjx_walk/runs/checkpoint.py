@@ -190,7 +190,7 @@ def prune(folder: Path, keep: int, newest: str | None = None) -> None:
     for path in list_steps(folder)[:-1]:
         shutil.rmtree(path / _REPLAY, ignore_errors=True)
     for path in folder.glob(f".*{_UNFINISHED}"):
-        shutil.rmtree(path)
+        _remove(path)
 
 
 class BackgroundSaver:
@@ -249,8 +249,16 @@ def _replacing_folder(path: Path) -> Iterator[Path]:
             os.replace(former, path)
         raise
     finally:
-        shutil.rmtree(former, ignore_errors=True)
-        shutil.rmtree(unfinished, ignore_errors=True)
+        _remove(former)
+        _remove(unfinished)
+
+
+def _remove(path: Path) -> None:
+    """Remove a folder, or a file that stands in its place, if there is one."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _is_replay(name: str) -> bool:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mjx_walk.runs.checkpoint import list_steps
 from mjx_walk.runs.config import Config, flatten, read_config, save_config
+from mjx_walk.runs.scores import BEST, FINAL
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["MAY_DIFFER", "RunFolder", "differences", "new_path", "open_existing", "prepare"]
@@ -52,7 +53,7 @@ def open_existing(path: str | Path | None) -> RunFolder:
     """Open the folder of an existing run.
 
     Raises:
-        UserError: no path, no run at that path, or a link, pipe or device inside the run.
+        UserError: no path, no run at that path, a link, pipe or device inside the run, or a folder in place of a file.
     """
     if path is None:
         raise UserError("say which run: run=RUN_DIR")
@@ -60,6 +61,12 @@ def open_existing(path: str | Path | None) -> RunFolder:
     if not folder.config.is_file():
         raise UserError(f"no run at '{path}': give the folder that holds its config.yaml")
     _refuse_special_files(folder.path)
+    for path in (folder.metrics, folder.gymnasium_scores):
+        if path.is_dir():
+            raise UserError(f"'{path}' is a folder, where a run has a file; remove it")
+    for path in (folder.checkpoints, folder.policy(FINAL), folder.policy(BEST)):
+        if path.is_file():
+            raise UserError(f"'{path}' is a file, where a run has a folder; remove it")
     return folder
 
 

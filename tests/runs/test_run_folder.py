@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 
+import numpy as np
 import pytest
 from helpers import OLD_RUNS, command_here, train_here
 
@@ -77,6 +78,23 @@ def test_a_pipe_in_a_run_folder_is_refused(downloaded, name):
     os.mkfifo(downloaded / name)
     with pytest.raises(UserError, match=f"{name}' is not a regular file; remove it"):
         open_existing(downloaded)
+
+
+@pytest.mark.parametrize("name", ["metrics.jsonl", "eval_gymnasium.json", "checkpoints", "checkpoints/best"])
+def test_a_folder_in_place_of_a_file_is_refused_and_the_other_way_round(downloaded, name):
+    path = downloaded / name
+    shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    path.mkdir() if path.suffix else path.write_text("x")
+    with pytest.raises(UserError, match=f"{name}' is a .*remove it"):
+        open_existing(downloaded)
+
+
+def test_a_save_replaces_a_file_in_place_of_a_checkpoint(tmp_path):
+    for name in ("best", f".best.{'0' * 16}.unfinished"):
+        (tmp_path / name).write_text("x")
+    checkpoint.save(tmp_path / "best", {"a": np.zeros(2)}, {})
+    checkpoint.prune(tmp_path, keep=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["best"] and (tmp_path / "best").is_dir()
 
 
 def test_a_saved_project_of_weights_and_biases_is_used_only_if_it_is_named(downloaded):
