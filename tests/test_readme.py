@@ -17,7 +17,7 @@ from mjx_walk.runs.config import load_config
 
 RESULTS = (CLONE / "docs" / "results.md").read_text()
 PAGES = {path: path.read_text() for path in (CLONE / "README.md", *sorted((CLONE / "docs").glob("*.md")))}
-RUN_ELSEWHERE = ("bench", "parity")
+RUN_ELSEWHERE = ("bench", "parity", "compare suite=")
 """Commands that tests of their own run, at sizes of their own."""
 
 

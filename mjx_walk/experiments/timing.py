@@ -13,7 +13,7 @@ from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.subprocesses import start_module
 
-_ENDLESS = 10**15
+_ENDLESS = 10**12
 _MIN_CALLS = 3
 
 
