@@ -115,7 +115,7 @@ def test_a_browser_plays_it(tmp_path, episode):
         assert not complaints
         assert float(shown["time (s)"]) == pytest.approx(at)
         assert float(shown["return so far"]) == pytest.approx(episode.rewards[: step + 1].sum(), abs=0.06)
-        assert float(shown["torso height (m)"]) == pytest.approx(episode.torso[step, 2], abs=0.006)
+        assert float(shown["torso height (m)"]) == pytest.approx(episode.body[step, 2], abs=0.006)
         forward = float(shown["reward_forward"])
         assert forward == pytest.approx(episode.reward_terms["reward_forward"][step], abs=6e-4)
         browse(path, at, f"--screenshot={tmp_path}/{at}.png")
