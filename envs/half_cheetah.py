@@ -6,29 +6,28 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-from mjx_walk.envs.info import Info
 from mjx_walk.envs.physics import Derived, PhysicsState
+from mjx_walk.envs.planar_body import PlanarBody, PlanarBodyOptions
 from mjx_walk.envs.resets import InitialState, with_normal_velocity
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
-from mjx_walk.envs.task import Task
-from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.settings import setting
 
 
 @dataclasses.dataclass
-class HalfCheetahOptions(TaskOptions):
+class HalfCheetahOptions(PlanarBodyOptions):
     """Keyword arguments of Gymnasium's `HalfCheetahEnv`."""
 
     name: str = setting("half_cheetah", choices=("half_cheetah",))
     forward_reward_weight: float = 1.0
     ctrl_cost_weight: float = 0.1
     reset_noise_scale: float = setting(0.1, at_least=0)
-    exclude_current_positions_from_observation: bool = True
 
 
-class HalfCheetah(Task):
+class HalfCheetah(PlanarBody):
     """HalfCheetah, whose episodes end only at the time limit.
+
+    Observation `[17]`: height, torso angle, six joint angles, and nine velocities.
 
     Source: `gymnasium/envs/mujoco/half_cheetah_v5.py` and `half_cheetah_v4.py`. The model integrates with Euler.
     """
@@ -36,25 +35,11 @@ class HalfCheetah(Task):
     GYMNASIUM_NAME = "HalfCheetah"
     XML_FILES = {"v5": "half_cheetah.xml", "v4": "half_cheetah.xml"}
     REWARD_TERMS = {"v5": ("reward_forward", "reward_ctrl"), "v4": ("reward_run", "reward_ctrl")}
-    HAS_Y = False
-    HEIGHT_INDEX = 1
 
     options: HalfCheetahOptions
 
     def initial_state(self, key: PRNGKeyArray) -> InitialState:
         return with_normal_velocity(key, self.init_qpos, self.init_qvel, self.options.reset_noise_scale)
-
-    def derived_names(self) -> tuple[str, ...]:
-        return ()
-
-    def observation_blocks(self) -> dict[str, int]:
-        skipped = int(self.options.exclude_current_positions_from_observation)
-        return {"qpos": self.model.nq - skipped, "qvel": self.model.nv}
-
-    def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
-        """Observation `[17]`: height, torso angle, six joint angles, and nine velocities."""
-        qpos = physics.qpos[1:] if self.options.exclude_current_positions_from_observation else physics.qpos
-        return jnp.concatenate([qpos, physics.qvel])
 
     def reward_and_termination(
         self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
@@ -67,9 +52,3 @@ class HalfCheetah(Task):
             control: -options.ctrl_cost_weight * jnp.square(action).sum(),
         }
         return terms, sum(terms.values(), jnp.float32(0.0)), jnp.zeros((), bool)
-
-    def position_info(self, state: State) -> Info:
-        return {"x_position": state.physics.qpos[0]}
-
-    def velocity_info(self, before: State, after: State) -> Info:
-        return {"x_velocity": (after.physics.qpos[0] - before.physics.qpos[0]) / self.dt}

@@ -9,19 +9,15 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from mjx_walk.envs.info import Info
 from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
+from mjx_walk.envs.planar_body import PlanarBody, PlanarBodyOptions
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
-from mjx_walk.envs.task import Task
-from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.settings import setting
-
-MAX_OBSERVED_VELOCITY = 10.0
-"""Limit to which observed velocities are clipped, m/s and rad/s."""
 
 
 @dataclasses.dataclass
-class HopperOptions(TaskOptions):
+class HopperOptions(PlanarBodyOptions):
     """Keyword arguments of Gymnasium's `HopperEnv`."""
 
     name: str = setting("hopper", choices=("hopper",))
@@ -34,11 +30,12 @@ class HopperOptions(TaskOptions):
     healthy_z_range: tuple[float, float] = (0.7, float("inf"))
     healthy_angle_range: tuple[float, float] = (-0.2, 0.2)
     reset_noise_scale: float = setting(5e-3, at_least=0)
-    exclude_current_positions_from_observation: bool = True
 
 
-class Hopper(Task):
+class Hopper(PlanarBody):
     """Hopper, which hops forward and must not fall.
+
+    Observation `[11]`: height, torso angle, three joint angles, and six clipped velocities.
 
     Source: `gymnasium/envs/mujoco/hopper_v5.py` and `hopper_v4.py`.
     """
@@ -47,8 +44,7 @@ class Hopper(Task):
     XML_FILES = {"v5": "hopper.xml", "v4": "hopper.xml"}
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_forward", "reward_ctrl", "reward_survive"))
     V4_INFO_HAS_TERMS = False
-    HAS_Y = False
-    HEIGHT_INDEX = 1
+    MAX_OBSERVED_VELOCITY = 10.0
     MODEL_NEEDS = ModelNeeds(positions=3)
 
     options: HopperOptions
@@ -59,19 +55,6 @@ class Hopper(Task):
 
     def initial_state(self, key: PRNGKeyArray) -> InitialState:
         return with_uniform_noise(key, self.init_qpos, self.init_qvel, self.options.reset_noise_scale)
-
-    def derived_names(self) -> tuple[str, ...]:
-        return ()
-
-    def observation_blocks(self) -> dict[str, int]:
-        skipped = int(self.options.exclude_current_positions_from_observation)
-        return {"qpos": self.model.nq - skipped, "qvel": self.model.nv}
-
-    def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
-        """Observation `[11]`: height, torso angle, three joint angles, and six clipped velocities."""
-        qpos = physics.qpos[1:] if self.options.exclude_current_positions_from_observation else physics.qpos
-        qvel = jnp.clip(physics.qvel, -MAX_OBSERVED_VELOCITY, MAX_OBSERVED_VELOCITY)
-        return jnp.concatenate([qpos, qvel])
 
     def reward_and_termination(
         self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
@@ -92,12 +75,8 @@ class Hopper(Task):
         return terms, sum(terms.values(), jnp.float32(0.0)), ~is_healthy & options.terminate_when_unhealthy
 
     def position_info(self, state: State) -> Info:
-        x, z = state.physics.qpos[:2]
-        height = {"z_distance_from_origin": z - self.init_qpos[1]} if self.options.version == "v5" else {}
-        return {"x_position": x} | height
-
-    def velocity_info(self, before: State, after: State) -> Info:
-        return {"x_velocity": (after.physics.qpos[0] - before.physics.qpos[0]) / self.dt}
+        height = {"z_distance_from_origin": state.physics.qpos[1] - self.init_qpos[1]}
+        return super().position_info(state) | (height if self.options.version == "v5" else {})
 
 
 def _is_within(value: Float[Array, "*shape"], bounds: tuple[float, float]) -> Bool[Array, "*shape"]:

@@ -9,25 +9,20 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from mjx_walk.envs.info import Info
 from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
+from mjx_walk.envs.planar_body import PlanarBody, PlanarBodyOptions
 from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
-from mjx_walk.envs.task import Task
-from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.settings import setting
-
-MAX_OBSERVED_VELOCITY = 10.0
-"""Limit to which observed velocities are clipped, m/s and rad/s."""
 
 
 @dataclasses.dataclass
-class Walker2dOptions(TaskOptions):
+class Walker2dOptions(PlanarBodyOptions):
     """Keyword arguments of Gymnasium's `Walker2dEnv`."""
 
     name: str = setting("walker2d", choices=("walker2d",))
     frame_skip: int = setting(4, at_least=1)
     reset_noise_scale: float = setting(5e-3, at_least=0)
-    exclude_current_positions_from_observation: bool = True
     forward_reward_weight: float = 1.0
     ctrl_cost_weight: float = 1e-3
     healthy_reward: float = 1.0
@@ -36,16 +31,17 @@ class Walker2dOptions(TaskOptions):
     healthy_angle_range: tuple[float, float] = (-1.0, 1.0)
 
 
-class Walker2d(Task):
+class Walker2d(PlanarBody):
     """Walker2d, which runs forward and must not fall.
+
+    Observation `[17]`: height, torso angle, six joint angles, and nine clipped velocities.
 
     Source: `gymnasium/envs/mujoco/walker2d_v5.py` and `walker2d_v4.py`. In v4's model the right foot has friction 0.9.
     """
 
     GYMNASIUM_NAME = "Walker2d"
     XML_FILES = {"v5": "walker2d_v5.xml", "v4": "walker2d.xml"}
-    HAS_Y = False
-    HEIGHT_INDEX = 1
+    MAX_OBSERVED_VELOCITY = 10.0
     MODEL_NEEDS = ModelNeeds(positions=3)
     REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_forward", "reward_ctrl", "reward_survive"))
     V4_INFO_HAS_TERMS = False
@@ -58,19 +54,6 @@ class Walker2d(Task):
 
     def initial_state(self, key: PRNGKeyArray) -> InitialState:
         return with_uniform_noise(key, self.init_qpos, self.init_qvel, self.options.reset_noise_scale)
-
-    def derived_names(self) -> tuple[str, ...]:
-        return ()
-
-    def observation_blocks(self) -> dict[str, int]:
-        skipped = int(self.options.exclude_current_positions_from_observation)
-        return {"qpos": self.model.nq - skipped, "qvel": self.model.nv}
-
-    def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
-        """Observation `[17]`: height, torso angle, six joint angles, and nine clipped velocities."""
-        qpos = physics.qpos[1:] if self.options.exclude_current_positions_from_observation else physics.qpos
-        qvel = jnp.clip(physics.qvel, -MAX_OBSERVED_VELOCITY, MAX_OBSERVED_VELOCITY)
-        return jnp.concatenate([qpos, qvel])
 
     def reward_and_termination(
         self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
@@ -89,9 +72,5 @@ class Walker2d(Task):
         return terms, sum(terms.values(), jnp.float32(0.0)), ~is_healthy & options.terminate_when_unhealthy
 
     def position_info(self, state: State) -> Info:
-        x, z = state.physics.qpos[:2]
-        height = {"z_distance_from_origin": z - self.init_qpos[1]} if self.options.version == "v5" else {}
-        return {"x_position": x} | height
-
-    def velocity_info(self, before: State, after: State) -> Info:
-        return {"x_velocity": (after.physics.qpos[0] - before.physics.qpos[0]) / self.dt}
+        height = {"z_distance_from_origin": state.physics.qpos[1] - self.init_qpos[1]}
+        return super().position_info(state) | (height if self.options.version == "v5" else {})
