@@ -16,10 +16,10 @@ from mjx_walk.envs.inverted_double_pendulum import InvertedDoublePendulum, Inver
 from mjx_walk.envs.inverted_pendulum import InvertedPendulum, InvertedPendulumOptions
 from mjx_walk.envs.pusher import Pusher, PusherOptions
 from mjx_walk.envs.reacher import Reacher, ReacherOptions
-from mjx_walk.envs.reward_files import changed_file, load_from_file
 from mjx_walk.envs.swimmer import Swimmer, SwimmerOptions
 from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.user_files import changed_file, load_from_file
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import with_name

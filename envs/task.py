@@ -13,10 +13,10 @@ from mjx_walk.envs import models
 from mjx_walk.envs.info import GymnasiumInfo
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
-from mjx_walk.envs.reward_files import load_reward_function
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, shaping_terms, term_names
 from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape
 from mjx_walk.envs.task_options import TaskOptions, check_version
+from mjx_walk.envs.user_files import load_reward_function
 from mjx_walk.envs.view import View
 from mjx_walk.utils.errors import UserError
 

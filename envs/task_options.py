@@ -5,9 +5,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mjx_walk.envs.reward_files import absolute_source
 from mjx_walk.envs.reward_shaping import Shaping
 from mjx_walk.envs.state import NO_TIME_LIMIT
+from mjx_walk.envs.user_files import absolute_source
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import setting
 

@@ -17,7 +17,7 @@ from mjx_walk.algos import make_algorithm
 from mjx_walk.envs import BUILT_IN_TASKS, Task, register_task
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.envs.registry import task_name
-from mjx_walk.envs.reward_files import only_known, reward_path
+from mjx_walk.envs.user_files import only_known, source_path
 from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium, score_in_sim
 from mjx_walk.runs import run_folder
 from mjx_walk.runs.config import Config, load_config, read_config
@@ -244,7 +244,7 @@ def _as_saved(config: Config, overrides: list[str]) -> Config:
             or logs to Weights & Biases, and the overrides do not say so. A folder must not run code or upload.
     """
     if config.env.reward_function:
-        only_known(reward_path(config.env.reward_function), None)
+        only_known(source_path(config.env.reward_function), None)
     given = {present_key(override.partition("=")[0]) for override in overrides}
     if not (config.resume and config.run_dir) or given & {"env", "algo", "recipe"}:
         return config

@@ -10,7 +10,7 @@ from mjx_walk.envs.registry import (
     register_task_file,
     task_hashes,
 )
-from mjx_walk.envs.reward_files import absolute_source, only_known, reward_path
+from mjx_walk.envs.user_files import absolute_source, only_known, source_path
 from mjx_walk.runs.trust import remember, require_trusted
 from mjx_walk.utils.errors import UserError
 
@@ -33,7 +33,7 @@ def name_task(source: str) -> tuple[str, str]:
         UserError: the file or the class is missing or invalid, or the name is taken.
     """
     source = absolute_source(source, Path.cwd())
-    only_known(reward_path(source), None)
+    only_known(source_path(source), None)
     name = register_task_file(source)
     remember(source, task_hashes(name), KEY)
     return name, source

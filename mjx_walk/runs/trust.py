@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mjx_walk.envs.reward_files import changed_file, only_known, reward_path
+from mjx_walk.envs.user_files import changed_file, only_known, source_path
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import write_text
 
@@ -68,7 +68,7 @@ def require_trusted(source: str, key: str = "env.reward_function") -> None:
     changed = changed_file(hashes)
     if changed:
         raise UserError(f"{changed} has changed since you named it; to run it as it is now, add {_named(key, source)}")
-    only_known(reward_path(source), hashes)
+    only_known(source_path(source), hashes)
 
 
 def _named(key: str, source: str) -> str:

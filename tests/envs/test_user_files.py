@@ -8,7 +8,7 @@ import typing
 
 import pytest
 
-from mjx_walk.envs.reward_files import absolute_source, changed_file, load_reward_function, only_known
+from mjx_walk.envs.user_files import absolute_source, changed_file, load_reward_function, only_known
 from mjx_walk.utils.errors import UserError
 
 WITH_DATACLASS = """
@@ -37,7 +37,7 @@ def clean():
     path, names, finders = list(sys.path), {*sys.modules}, list(sys.meta_path)
     yield
     assert sys.path == path and sys.meta_path == finders
-    assert {name for name in {*sys.modules} - names if not name.startswith("_mjx_walk_reward_")} == set()
+    assert {name for name in {*sys.modules} - names if not name.startswith("_mjx_walk_user_file_")} == set()
 
 
 def write(folder, factor=3, bonus=5):

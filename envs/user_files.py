@@ -15,26 +15,26 @@ from typing import Any
 from mjx_walk.utils.errors import UserError
 
 __all__ = [
-    "RewardFile",
+    "UserFile",
     "absolute_source",
     "changed_file",
     "load_from_file",
     "load_reward_function",
     "only_known",
-    "reward_path",
+    "source_path",
 ]
 
 _NUMBERS = itertools.count()
-_PREFIX = "_mjx_walk_reward_"
-"""Start of the names in `sys.modules` of the reward files themselves."""
+_PREFIX = "_mjx_walk_user_file_"
+"""Start of the names in `sys.modules` of the user's files themselves."""
 _NEVER_HELPERS = sys.stdlib_module_names | {"mjx_walk"}
 _INSTALLED = ("site-packages", "dist-packages")
 
 _known: dict[Path, Mapping[str, str]] = {}
-"""The SHA-256 of all files that a reward file may run, by the path of the reward file. Others may run any."""
+"""The SHA-256 of all files that a user's file may run, by the path of that file. Others may run any."""
 
 
-def reward_path(source: str) -> Path:
+def source_path(source: str) -> Path:
     """Absolute path of the file in `PATH.py:FUNCTION`."""
     return Path(os.path.abspath(Path(source.rpartition(":")[0]).expanduser()))
 
@@ -63,10 +63,10 @@ def changed_file(hashes: Mapping[str, str]) -> str | None:
 
 
 def only_known(path: Path, hashes: Mapping[str, str] | None) -> None:
-    """Restrict what a reward file may run in this process.
+    """Restrict what a user's file may run in this process.
 
     Args:
-        path: of the reward file.
+        path: of the file.
         hashes: SHA-256 of that file and its helpers, by absolute path; None removes the restriction.
     """
     _known.pop(path, None)
@@ -74,11 +74,11 @@ def only_known(path: Path, hashes: Mapping[str, str] | None) -> None:
         _known[path] = hashes
 
 
-class RewardFile:
+class UserFile:
     """A function or class of a Python file. Modules beside the file are importable while it loads and while it runs.
 
     Its modules come from the source only: a file in `__pycache__` is never run. Helpers have their usual names, but
-    leave `sys.modules` afterwards, so that another reward file's helper of the same name is another module.
+    leave `sys.modules` afterwards, so that another file's helper of the same name is another module.
     """
 
     def __init__(self, path: Path, name: str, kind: str = "function"):
@@ -196,7 +196,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
             self._loaded[module.__name__] = module
 
 
-def load_reward_function(source: str) -> RewardFile:
+def load_reward_function(source: str) -> UserFile:
     """Load a reward function from a Python file.
 
     Args:
@@ -208,7 +208,7 @@ def load_reward_function(source: str) -> RewardFile:
     return load_from_file("env.reward_function", source, "FUNCTION")
 
 
-def load_from_file(key: str, source: str, kind: str) -> RewardFile:
+def load_from_file(key: str, source: str, kind: str) -> UserFile:
     """Load a function or class from a Python file.
 
     Args:
@@ -219,7 +219,7 @@ def load_from_file(key: str, source: str, kind: str) -> RewardFile:
     Raises:
         UserError: the file or the name does not exist, or the file raises an exception.
     """
-    path, name = reward_path(source), source.rpartition(":")[2]
+    path, name = source_path(source), source.rpartition(":")[2]
     problem = f"{key}={source}: "
     if not path.is_file():
         given = source.rpartition(":")[0] or source
@@ -227,7 +227,7 @@ def load_from_file(key: str, source: str, kind: str) -> RewardFile:
     if path.suffix != ".py":
         raise UserError(f"{problem}'{path}' is not a Python file; write PATH.py:{kind}")
     try:
-        return RewardFile(path, name, kind.lower())
+        return UserFile(path, name, kind.lower())
     except UserError as error:
         raise UserError(f"{problem}{error}") from error
     except (Exception, SystemExit) as error:
