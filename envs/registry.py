@@ -1,8 +1,6 @@
 """The tasks by name: this package's own, and those that a user registers or names as `FILE.py:CLASS`."""
 
-import inspect
 import re
-import sys
 import typing
 from pathlib import Path
 from typing import Any
@@ -22,12 +20,12 @@ from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.envs.user_files import changed_file, load_from_file
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.registration import check_class, check_decorated
 from mjx_walk.utils.settings import with_name
 
 __all__ = [
     "BUILT_IN_TASKS",
     "TASKS",
-    "identity",
     "is_registered_from",
     "register_task",
     "register_task_file",
@@ -71,13 +69,15 @@ def register_task(name: str, task: type[Task], options: type[TaskOptions] | None
     Raises:
         UserError: a name that is taken or invalid, or a class of another kind.
     """
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in _RESERVED:
-        raise UserError(f"a task cannot be called '{name}'; use other lower-case letters, digits and underscores")
+    if name in _RESERVED:
+        raise UserError(f"a task cannot be called '{name}', which has a meaning of its own; choose another name")
     if name in BUILT_IN_TASKS:
         raise UserError(f"'{name}' is a task of this package; choose another name")
-    _check_task(name, task)
-    if name in TASKS and identity(TASKS[name][0]) != identity(task):
-        raise UserError(f"a task '{name}' is registered already, from {identity(TASKS[name][0])}; choose another name")
+    known = {other: kind for other, (kind, _) in TASKS.items()}
+    check_class("a task", name, task, "mjx_walk.envs.Task", Task, known)
+    for attribute in ("XML_FILES", "REWARD_TERMS"):
+        if not isinstance(getattr(task, attribute, None), dict):
+            raise UserError(f"the class {task.__name__} of the task '{name}' needs {attribute} = {{'v5': …}}")
     options = options or typing.get_type_hints(task).get("options", TaskOptions)
     _check_options(name, options)
     TASKS[name] = (task, with_name(options, name))
@@ -127,25 +127,7 @@ def task_name(task: Any) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", getattr(task, "__name__", str(task))).lower()
 
 
-def identity(kind: type) -> str:
-    """The file, or without one the module, and the name of a class. It stays the same when the file runs again."""
-    module = sys.modules.get(kind.__module__)
-    return f"{getattr(module, '__file__', None) or kind.__module__}:{kind.__qualname__}"
-
-
-def _check_task(name: str, task: Any) -> None:
-    if not (isinstance(task, type) and issubclass(task, Task)):
-        raise UserError(f"the task '{name}' is {task!r}; give a subclass of mjx_walk.envs.Task")
-    if inspect.isabstract(task):
-        missing = ", ".join(sorted(task.__abstractmethods__))
-        raise UserError(f"the class {task.__name__} of the task '{name}' does not define: {missing}")
-    for attribute in ("XML_FILES", "REWARD_TERMS"):
-        if not isinstance(getattr(task, attribute, None), dict):
-            raise UserError(f"the class {task.__name__} of the task '{name}' needs {attribute} = {{'v5': …}}")
-
-
 def _check_options(name: str, options: Any) -> None:
     if not (isinstance(options, type) and issubclass(options, TaskOptions)):
         raise UserError(f"the options of the task '{name}' are {options!r}; give a dataclass derived from TaskOptions")
-    if "__dataclass_fields__" not in vars(options):
-        raise UserError(f"decorate {options.__name__}, the options of the task '{name}', with @dataclasses.dataclass")
+    check_decorated(options, f"options of the task '{name}'")

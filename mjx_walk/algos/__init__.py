@@ -3,8 +3,6 @@
 Networks, returns, replay and optimizers that they share are in `mjx_walk.common`; the loop is in `mjx_walk.training`.
 """
 
-import inspect
-import re
 from typing import Any
 
 from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
@@ -20,8 +18,8 @@ from mjx_walk.algos.sac import SAC, SACConfig
 from mjx_walk.algos.td3 import TD3, TD3Config
 from mjx_walk.envs import Task
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
-from mjx_walk.envs.registry import identity
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.registration import check_class, check_decorated
 from mjx_walk.utils.settings import with_name
 
 ALGORITHMS: dict[str, tuple[type[Algorithm], type]] = {
@@ -71,20 +69,11 @@ def register_algorithm(name: str, algorithm: type[Algorithm], config: type) -> N
     Raises:
         UserError: a name that is taken or invalid, or a class of another kind.
     """
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise UserError(f"an algorithm cannot be called '{name}'; use lower-case letters, digits and underscores")
     if name in BUILT_IN_ALGORITHMS:
         raise UserError(f"'{name}' is an algorithm of this package; choose another name")
-    if not (isinstance(algorithm, type) and issubclass(algorithm, Algorithm)):
-        raise UserError(f"the algorithm '{name}' is {algorithm!r}; give a subclass of mjx_walk.algos.Algorithm")
-    if inspect.isabstract(algorithm):
-        missing = ", ".join(sorted(algorithm.__abstractmethods__))
-        raise UserError(f"the class {algorithm.__name__} of the algorithm '{name}' does not define: {missing}")
+    known = {other: kind for other, (kind, _) in ALGORITHMS.items()}
+    check_class("an algorithm", name, algorithm, "mjx_walk.algos.Algorithm", Algorithm, known)
     if not (isinstance(config, type) and issubclass(config, OnPolicyConfig | OffPolicyConfig)):
         raise UserError(f"the settings of '{name}' are {config!r}; derive them from OnPolicyConfig or OffPolicyConfig")
-    if "__dataclass_fields__" not in vars(config):
-        raise UserError(f"decorate {config.__name__}, the settings of '{name}', with @dataclasses.dataclass")
-    if name in ALGORITHMS and identity(ALGORITHMS[name][0]) != identity(algorithm):
-        known = identity(ALGORITHMS[name][0])
-        raise UserError(f"an algorithm '{name}' is registered already, from {known}; choose another name")
+    check_decorated(config, f"settings of '{name}'")
     ALGORITHMS[name] = (algorithm, with_name(config, name))
