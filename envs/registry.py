@@ -74,7 +74,7 @@ def register_task(name: str, task: type[Task], options: type[TaskOptions] | None
     if name in BUILT_IN_TASKS:
         raise UserError(f"'{name}' is a task of this package; choose another name")
     known = {other: kind for other, (kind, _) in TASKS.items()}
-    check_class("a task", name, task, "mjx_walk.envs.Task", Task, known)
+    check_class("a task", name, task, Task, "mjx_walk.envs", known)
     for attribute in ("XML_FILES", "REWARD_TERMS"):
         if not isinstance(getattr(task, attribute, None), dict):
             raise UserError(f"the class {task.__name__} of the task '{name}' needs {attribute} = {{'v5': …}}")

@@ -72,7 +72,7 @@ def register_algorithm(name: str, algorithm: type[Algorithm], config: type) -> N
     if name in BUILT_IN_ALGORITHMS:
         raise UserError(f"'{name}' is an algorithm of this package; choose another name")
     known = {other: kind for other, (kind, _) in ALGORITHMS.items()}
-    check_class("an algorithm", name, algorithm, "mjx_walk.algos.Algorithm", Algorithm, known)
+    check_class("an algorithm", name, algorithm, Algorithm, "mjx_walk.algos", known)
     if not (isinstance(config, type) and issubclass(config, OnPolicyConfig | OffPolicyConfig)):
         raise UserError(f"the settings of '{name}' are {config!r}; derive them from OnPolicyConfig or OffPolicyConfig")
     check_decorated(config, f"settings of '{name}'")

@@ -10,15 +10,15 @@ from mjx_walk.utils.errors import UserError
 __all__ = ["check_class", "check_decorated", "identity"]
 
 
-def check_class(what: str, name: str, kind: Any, base: str, base_class: type, known: Mapping[str, type]) -> None:
+def check_class(what: str, name: str, kind: Any, base: type, module: str, known: Mapping[str, type]) -> None:
     """Check a class that is to be registered.
 
     Args:
         what: `a task` or `an algorithm`.
         name: under which it is to be registered.
         kind: the class.
-        base: where users import the base class from.
-        base_class: the class from which it must derive.
+        base: the class from which it must derive.
+        module: from which users import the base class.
         known: classes that are registered already, by name. One that stays the same may be registered again.
 
     Raises:
@@ -27,8 +27,8 @@ def check_class(what: str, name: str, kind: Any, base: str, base_class: type, kn
     noun = what.rpartition(" ")[2]
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UserError(f"{what} cannot be called '{name}'; use lower-case letters, digits and underscores")
-    if not (isinstance(kind, type) and issubclass(kind, base_class)):
-        raise UserError(f"the {noun} '{name}' is {kind!r}; give a subclass of {base}")
+    if not (isinstance(kind, type) and issubclass(kind, base)):
+        raise UserError(f"the {noun} '{name}' is {kind!r}; give a subclass of {module}.{base.__name__}")
     missing = sorted(getattr(kind, "__abstractmethods__", ()))
     if missing:
         raise UserError(f"the class {kind.__name__} of the {noun} '{name}' does not define: {', '.join(missing)}")
