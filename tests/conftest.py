@@ -5,15 +5,27 @@ does, are in no cache. `_QUICK_COMPILE` cuts compile times. `helpers.OPTIMIZED` 
 `_SAFE_REDUCTIONS` is what `mjx_walk.prepare_jax` sets; tests use JAX before they call anything that sets it.
 """
 
+import atexit
 import os
+import shutil
 import tempfile
 
 os.environ["JAX_PLATFORMS"] = "cpu"
 _QUICK_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 _SAFE_REDUCTIONS = "--xla_cpu_experimental_ynn_fusion_type=-reduce"
-os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="mjx_walk_config_")
+
+
+def _temporary_folder() -> str:
+    """A folder that lasts as long as this process."""
+    path = tempfile.mkdtemp(prefix="mjx_walk_tests_")
+    atexit.register(shutil.rmtree, path, ignore_errors=True)
+    return path
+
+
+os.environ["XDG_CONFIG_HOME"] = _temporary_folder()
 _FLAGS = os.environ.get("XLA_FLAGS", "")
 if _QUICK_COMPILE not in _FLAGS:  # pytest-xdist's workers inherit the flags
     os.environ["XLA_FLAGS"] = f"{_QUICK_COMPILE} {_SAFE_REDUCTIONS} {_FLAGS}".rstrip()
-_CACHE = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", tempfile.mkdtemp(prefix="mjx_walk_jax_"))
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _temporary_folder()
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")

@@ -1,5 +1,6 @@
 """The commands and code of the documentation."""
 
+import dataclasses
 import re
 import shlex
 import shutil
@@ -8,10 +9,11 @@ from pathlib import Path
 import jax.numpy as jnp
 import mujoco
 import pytest
-from helpers import CLONE, README, TINY, blocks, command
+from helpers import CLONE, README, TINY, TINY_OFF_POLICY, blocks, command
 
 import mjx_walk
 from mjx_walk import zoo
+from mjx_walk.algos.on_policy import OnPolicyConfig
 from mjx_walk.envs import TASKS, make_env
 from mjx_walk.runs.config import load_config
 
@@ -114,6 +116,16 @@ def small_run(tmp_path_factory):
     return folder
 
 
+def sizes(arguments):
+    """Those of a small run that the algorithm has and the arguments do not give."""
+    first_job = [re.sub(r",.*", "", argument) for argument in arguments if not argument.startswith(("-", "hydra."))]
+    config = load_config([*first_job, "run_dir=null"])
+    have = {f"algo.{field.name}" for field in dataclasses.fields(config.algo)} | {"num_envs", "evaluation.num_envs"}
+    given = {argument.split("=")[0] for argument in arguments}
+    tiny = TINY if isinstance(config.algo, OnPolicyConfig) else TINY_OFF_POLICY
+    return [setting for setting in tiny if setting.split("=")[0] in have - given]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("line", all_commands())
 def test_every_command(line, small_run, tmp_path, monkeypatch):
@@ -133,7 +145,7 @@ def test_every_command(line, small_run, tmp_path, monkeypatch):
     elif "draw=true" in arguments:
         arguments = ["draw=true", f"out={small_run.parent}"]
     elif name == "train" and "--cfg" not in arguments:
-        arguments += ["total_steps=1", "evaluation.gymnasium_episodes=1"]
+        arguments += [*sizes(arguments), "total_steps=1", "evaluation.gymnasium_episodes=1"]
     elif name == "compare":
         arguments = [argument for argument in arguments if not argument.startswith(("seeds=", "total_steps="))]
         arguments = [re.sub(r"^algos=\[(\w+,\w+).*", r"algos=[\1]", argument) for argument in arguments]

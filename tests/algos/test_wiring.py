@@ -73,12 +73,17 @@ NOT_TRACED = {
     **{(algo, "name"): "it selects the algorithm" for algo in ALGORITHMS},
     ("reinforce", "max_value_grad_norm"): "it adds an optimizer without parameters, which old checkpoints may hold",
 }
-CASES = [
-    (algo, field.name)
-    for algo, (_, config) in ALGORITHMS.items()
-    for field in dataclasses.fields(config)
-    if (algo, field.name) not in NOT_TRACED
-]
+FIRST_OF_THEIR_KIND = ("ppo", "a2c", "sac", "td3")
+"""The others are their subclasses, or share their base. For those, the settings that they inherit are slow tests."""
+
+
+def cases():
+    for algo, (_, config) in ALGORITHMS.items():
+        own = config.__annotations__
+        for field in dataclasses.fields(config):
+            if (algo, field.name) not in NOT_TRACED:
+                marks = [] if algo in FIRST_OF_THEIR_KIND or field.name in own else [pytest.mark.slow]
+                yield pytest.param(algo, field.name, marks=marks, id=f"{algo}-{field.name}")
 
 
 def base_settings(algo, **further):
@@ -118,7 +123,7 @@ def program(algo, **settings):
     return re.sub(r"0x[0-9a-f]+", "", str(jaxpr)), constants
 
 
-@pytest.mark.parametrize(("algo", "name"), CASES, ids=[f"{algo}-{name}" for algo, name in CASES])
+@pytest.mark.parametrize(("algo", "name"), cases())
 def test_a_setting_changes_the_program_where_it_has_an_effect(algo, name):
     """With the settings that it needs, and without them."""
     for needs in [NEEDS[name], {}] if name in NEEDS else [{}]:
