@@ -121,8 +121,8 @@ class InlineEvaluator:
             starts: at least E fresh resets.
 
         Returns:
-            The round to continue; and its scores, NaN where no round has ended: `eval_return`, `eval_return_std`,
-            `eval_length`, and `eval_iteration`, the iterations before the scored policy.
+            The round to continue; and its scores, which have a value where a round has ended: `eval_return`,
+            `eval_return_std`, `eval_length`, and `eval_iteration`, the iterations before the scored policy.
         """
         is_late_enough = iteration - evaluation.snapshot_iteration >= self._min_iterations
         is_over = ~evaluation.alive.any() & is_late_enough
@@ -142,6 +142,4 @@ class InlineEvaluator:
             lambda new, old: jnp.where(is_best, new, old), snapshot, best
         )
         present = present.replace(best_policy_params=params, best_iteration=best_iteration, best_return=best_return)
-        return present, {
-            name: Metric(jnp.where(is_over, value, jnp.nan), Reduction.FIRST_DEVICE) for name, value in scores.items()
-        }
+        return present, {name: Metric(value, Reduction.FIRST_DEVICE).only_if(is_over) for name, value in scores.items()}

@@ -18,6 +18,7 @@ from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape
 from mjx_walk.envs.task_options import TaskOptions, check_version
 from mjx_walk.envs.user_files import load_reward_function
 from mjx_walk.envs.view import View
+from mjx_walk.utils.compat import standard_dtypes
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["MAX_ABS_VALUE", "Task"]
@@ -55,6 +56,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     VIEW: View = View()
     """What films show of the task's own model. `view` is for the model of `xml_file`."""
 
+    @standard_dtypes()
     def __init__(self, options: TaskOptions, physics: str = "auto", keep_info: bool = False):
         """
         Args:
@@ -187,10 +189,12 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 
     # Shared by all tasks.
 
+    @standard_dtypes()
     def reset(self, key: PRNGKeyArray) -> State:
         """Random initial state, drawn by `initial_state`."""
         return self.reset_to(*self.initial_state(key))
 
+    @standard_dtypes()
     def reset_to(
         self,
         qpos: Float[Array | np.ndarray, " nq"],
@@ -219,6 +223,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
             metrics={name: jnp.zeros((), jnp.float32) for name in self.metric_names},
         )
 
+    @standard_dtypes()
     def step(self, state: State, action: Float[Array, " action_size"]) -> State:
         """Advance by one environment step, which is `frame_skip` physics steps.
 

@@ -33,7 +33,7 @@ from mjx_walk.runs.trust import remember, require_trusted
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.memory_check import check_replay
 from mjx_walk.training.trainer import Trainer
-from mjx_walk.utils.compat import prepare_jax, temporary_jax_settings
+from mjx_walk.utils.compat import prepare_jax, standard_settings, temporary_jax_settings
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.signals import as_by_ctrl_c
 from mjx_walk.viewing.rendering import choose_opengl
@@ -51,6 +51,7 @@ class Run(SavedPolicy):
         """All rows of `metrics.jsonl`."""
         return read_rows(self.path / "metrics.jsonl")
 
+    @standard_settings()
     def evaluate(self, episodes: int = 100, backend: str = "gymnasium", seed: int = 0) -> Scores:
         """Score the deterministic policy.
 

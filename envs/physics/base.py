@@ -11,6 +11,7 @@ from jax import Array
 from jax.custom_batching import custom_vmap
 from jaxtyping import Bool, Float
 
+from mjx_walk.utils.compat import standard_dtypes
 from mjx_walk.utils.errors import UserError
 
 Derived = dict[str, Array]
@@ -86,6 +87,7 @@ def batch_once(batch_fn: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     @custom_vmap
+    @standard_dtypes()  # batched after the caller's own code was traced
     def on_batch(*args):
         return batch_fn(*args)
 

@@ -1,6 +1,7 @@
 """The `jax` engine: MJX's JAX implementation, on any JAX device."""
 
 import functools
+import operator
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +44,9 @@ class JaxEngine:
             changes: new values of `mjx.Model` by their paths, such as `body_mass` or `opt.gravity`, in the shapes of
                 the old ones. They may be traced. An empty dict restores the model.
         """
-        self._model = self._own_model.tree_replace(changes) if changes else self._own_model
+        own = self._own_model
+        changes = {path: jnp.asarray(value, operator.attrgetter(path)(own).dtype) for path, value in changes.items()}
+        self._model = own.tree_replace(changes) if changes else own
 
     def _data(self, state: PhysicsState) -> mjx.Data:
         return self._blank.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)

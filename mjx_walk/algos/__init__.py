@@ -7,7 +7,7 @@ from typing import Any
 
 from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
 from mjx_walk.algos.a2c import A2C, A2CConfig
-from mjx_walk.algos.base import Algorithm, TrainState
+from mjx_walk.algos.base import Algorithm, TrainState, is_finite, learned_leaves
 from mjx_walk.algos.csac import CSAC, CSACConfig
 from mjx_walk.algos.ddpg import DDPG, DDPGConfig
 from mjx_walk.algos.off_policy import OffPolicyConfig
@@ -35,7 +35,16 @@ ALGORITHMS: dict[str, tuple[type[Algorithm], type]] = {
 BUILT_IN_ALGORITHMS: tuple[str, ...] = tuple(ALGORITHMS)
 """Names that a user's algorithm cannot take."""
 
-__all__ = ["ALGORITHMS", "BUILT_IN_ALGORITHMS", "Algorithm", "TrainState", "make_algorithm", "register_algorithm"]
+__all__ = [
+    "ALGORITHMS",
+    "BUILT_IN_ALGORITHMS",
+    "Algorithm",
+    "TrainState",
+    "is_finite",
+    "learned_leaves",
+    "make_algorithm",
+    "register_algorithm",
+]
 
 
 def make_algorithm(

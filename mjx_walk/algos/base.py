@@ -7,11 +7,12 @@ from typing import Any
 
 import flax
 import jax
+import jax.numpy as jnp
 
 from mjx_walk.envs import Task
 from mjx_walk.envs.inline_evaluation import EvaluationConfig, InlineEvaluation, InlineEvaluator
 from mjx_walk.envs.vector_env import VectorEnv, VectorState
-from mjx_walk.utils.types import ITERATION_COUNT, PER_DEVICE, RANDOM_KEY, Metrics, PolicyFn
+from mjx_walk.utils.types import ITERATION_COUNT, PER_DEVICE, RANDOM_KEY, Metrics, PolicyFn, mark_flags
 
 
 class TrainState(flax.struct.PyTreeNode):
@@ -22,6 +23,25 @@ class TrainState(flax.struct.PyTreeNode):
     key: jax.Array = flax.struct.field(metadata=RANDOM_KEY)
     iterations: jax.Array = flax.struct.field(metadata=ITERATION_COUNT)
     """`[] i32`: iterations so far."""
+
+
+def learned_leaves(state: TrainState) -> dict[str, jax.Array]:
+    """Networks, optimizers and running statistics: the floating-point leaves that are not per device, by their paths.
+
+    The other leaves need no check. A task ends an episode whose physics is not finite, and running returns enter the
+    running statistics.
+    """
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="."): leaf
+        for (path, leaf), is_per_device in zip(leaves, mark_flags(state, "per_device"), strict=True)
+        if not is_per_device and jnp.issubdtype(leaf.dtype, jnp.floating)
+    }
+
+
+def is_finite(state: TrainState) -> jax.Array:
+    """Whether every learned leaf is finite, `[] bool`."""
+    return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in learned_leaves(state).values()]))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

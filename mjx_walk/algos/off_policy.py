@@ -278,7 +278,8 @@ class OffPolicyAlgorithm(Algorithm):
             "replay_transitions": jnp.minimum(replay.rows, self.buffer.num_rows) * jnp.float32(self.num_envs),
             "reward_scale": reward_scale,
         }
-        return new_state, env_metrics | as_means(metrics | facts)
+        learned = {name: metric.only_if(can_learn) for name, metric in as_means(metrics).items()}
+        return new_state, env_metrics | learned | as_means(facts)
 
     def _train(
         self,
@@ -322,6 +323,6 @@ def _keep(step: rollout.Step) -> Steps:
 
 
 def _wait(train: Any, learner: Any) -> tuple[Any, dict[str, jax.Array]]:
-    """The learner as it is, and metrics without values, before learning starts."""
+    """The learner as it is, and zeros for metrics, before learning starts."""
     shapes = jax.eval_shape(train, learner)[1]
-    return learner, jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
+    return learner, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)

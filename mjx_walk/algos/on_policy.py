@@ -21,7 +21,7 @@ from mjx_walk.common.optimizers import adapt_rate, apply_gradients, make_adam, r
 from mjx_walk.utils import collectives
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import AnyBut, setting
-from mjx_walk.utils.types import PER_DEVICE, Metric, Metrics, PolicyFn, Transition
+from mjx_walk.utils.types import PER_DEVICE, Metrics, PolicyFn, Transition
 
 
 @dataclasses.dataclass
@@ -249,11 +249,7 @@ class OnPolicyAlgorithm(Algorithm):
         old = (state.params, state.optimizer, state.learning_rate)
         new = (learned.params, learned.optimizer, learned.learning_rate)
         kept = jax.tree.map(lambda old, new: jnp.where(is_warmup, old, new), old, new)
-        known = {
-            name: Metric(jnp.where(is_warmup, jnp.nan, metric.value), metric.reduction)
-            for name, metric in metrics.items()
-            if name not in batch.metrics
-        }
+        known = {name: metric.only_if(~is_warmup) for name, metric in metrics.items() if name not in batch.metrics}
         return learned.replace(params=kept[0], optimizer=kept[1], learning_rate=kept[2]), metrics | known
 
     def remaining(self, state: OnPolicyState) -> jax.Array:

@@ -11,6 +11,7 @@ from brax.io import mjcf
 from mjx_walk.envs import NO_TIME_LIMIT, make_env
 from mjx_walk.envs.physics.mjx_model import with_newton_solver
 from mjx_walk.envs.state import check_action_shape
+from mjx_walk.utils.compat import standard_dtypes
 from mjx_walk.utils.errors import UserError
 
 
@@ -52,7 +53,7 @@ class BraxEnv(base.Env):
         if self._changed_sys is not None:
             return self._changed_sys
         if self._own_sys is None:
-            with jax.ensure_compile_time_eval():
+            with jax.ensure_compile_time_eval(), standard_dtypes():
                 sys = mjcf.load_model(with_newton_solver(self._task.model))
                 limits = jnp.tile(jnp.float32([-1.0, 1.0]), (self._task.action_size, 1))
                 self._own_sys = sys.replace(actuator=sys.actuator.replace(ctrl_range=limits))

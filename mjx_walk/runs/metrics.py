@@ -35,7 +35,8 @@ def name_metrics(metrics: Metrics, steps_per_iteration: int) -> Row:
     """
     by_reduction: dict[Reduction, dict[str, np.ndarray]] = {reduction: {} for reduction in Reduction}
     for name, metric in metrics.items():
-        by_reduction[metric.reduction][name] = np.asarray(metric.value, np.float64)
+        values = np.asarray(metric.value, np.float64)
+        by_reduction[metric.reduction][name] = values if metric.has_value is None else values[metric.has_value]
     counts = {name: float(value.sum()) for name, value in by_reduction[Reduction.SUM].items()}
     episodes = counts["episodes"]
     row: Row = {"episode/count": episodes}
@@ -47,14 +48,13 @@ def name_metrics(metrics: Metrics, steps_per_iteration: int) -> Row:
     row["resets/count"] = counts["resets"]
     row["resets/reuse_rate"] = counts["resets_reused"] / max(counts["resets"], 1.0)
     scores = {name.removeprefix("eval_"): value for name, value in by_reduction[Reduction.FIRST_DEVICE].items()}
-    ended = np.flatnonzero(~np.isnan(scores["return"]))
-    if ended.size:
-        last = {name: float(value[ended[-1]]) for name, value in scores.items()}
+    if scores["return"].size:
+        last = {name: float(value[-1]) for name, value in scores.items()}
         row["eval/env_steps"] = last.pop("iteration") * steps_per_iteration
         row |= {f"eval/{name}": value for name, value in last.items()}
     # Nothing is learned from the first batches, or before the replay holds enough.
-    known = {name: value[~np.isnan(value)] for name, value in by_reduction[Reduction.MEAN].items()}
-    return row | {f"train/{name}": float(value.mean()) for name, value in known.items() if value.size}
+    means = by_reduction[Reduction.MEAN]
+    return row | {f"train/{name}": float(value.mean()) for name, value in means.items() if value.size}
 
 
 def physics_warnings(row: Row, num_steps: int) -> dict[str, str]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_walk.algos import Algorithm, make_algorithm
@@ -16,6 +17,7 @@ from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config, read_config
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.scores import BEST, FINAL, POLICIES
+from mjx_walk.utils.compat import standard_settings
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["SavedPolicy", "deterministic_act", "make_acting_algorithm", "make_task"]
@@ -26,6 +28,7 @@ _LOGGER = logging.getLogger(__name__)
 class SavedPolicy:
     """A policy of a run folder, and the task that it was trained on."""
 
+    @standard_settings()
     def __init__(self, folder: RunFolder, physics: str | None = None, policy: str = BEST):
         """
         Args:
@@ -60,6 +63,7 @@ class SavedPolicy:
         kept = {name: value for name, value in vars(self).items() if name not in ("task", "algorithm", "act")}
         return kept | {"policy_params": jax.device_get(self.policy_params)}
 
+    @standard_settings()
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._build()
@@ -91,8 +95,14 @@ def make_acting_algorithm(task: Task, config: Config) -> Algorithm:
 
 def deterministic_act(algorithm: Algorithm, policy_params: Any) -> Callable[[Any], Any]:
     """Compile the deterministic policy, `obs […, observation_size] → action […, action_size]`, in Gymnasium's units."""
-    policy = algorithm.policy(policy_params, deterministic=True)
-    return jax.jit(lambda obs: policy(obs, jax.random.PRNGKey(0)))
+
+    @jax.jit
+    @standard_settings()
+    def act(obs: jax.Array) -> jax.Array:
+        policy = algorithm.policy(policy_params, deterministic=True)
+        return policy(jnp.asarray(obs, jnp.float32), jax.random.PRNGKey(0))
+
+    return act
 
 
 def choose_policy(folder: RunFolder, name: str) -> str:

@@ -172,14 +172,12 @@ def in_place(collect: Callable[[Any], tuple[Any, Any]]) -> Callable[[Any, Any], 
 
 
 def _over_devices(metric: Metric) -> Metric:
-    value = metric.value
+    """A metric of all devices. Either all of them have a mean in an iteration, or none."""
     if metric.reduction in (Reduction.SUM, Reduction.PER_EPISODE):
-        value = collectives.total(value, DEVICES)
-    elif metric.reduction is Reduction.FIRST_DEVICE:
-        value = jax.lax.all_gather(value, DEVICES)[0]
-    else:
-        value = collectives.mean(value, DEVICES)
-    return Metric(value, metric.reduction)
+        return metric.replace(value=collectives.total(metric.value, DEVICES))
+    if metric.reduction is Reduction.FIRST_DEVICE:
+        return jax.tree.map(lambda x: jax.lax.all_gather(x, DEVICES)[0], metric)
+    return metric.replace(value=collectives.mean(metric.value, DEVICES))
 
 
 def _squeeze(tree: Any) -> Any:

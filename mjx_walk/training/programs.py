@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_walk.algos import Algorithm, TrainState
+from mjx_walk.algos import Algorithm, TrainState, is_finite
 from mjx_walk.utils.types import Metrics
 
 Step = Callable[[TrainState], tuple[TrainState, Metrics]]
@@ -33,7 +33,7 @@ class Program(NamedTuple):
     split_metrics: Callable[[Metrics], list[Metrics]]
     """The metrics of each run, on the host, `[iterations]` each."""
     is_finite: Callable[[TrainState], np.ndarray]
-    """`[runs] bool`: whether each run's policy is finite."""
+    """`[runs] bool`: whether each run's learned leaves are finite."""
     max_over_processes: Callable[[int], int]
     """The largest of the numbers that the processes pass."""
 
@@ -77,7 +77,7 @@ def make_step(collect: Callable, learn: Callable, iterations_per_call: int, fuse
 
 def make_single_program(algorithm: Algorithm, iterations_per_call: int, fused: bool) -> Program:
     """One run on one device."""
-    is_finite = jax.jit(functools.partial(has_finite_policy, algorithm))
+    check = jax.jit(is_finite)
     init = make_init(algorithm.init)
     return Program(
         init=lambda keys: init(keys[0]),
@@ -86,7 +86,7 @@ def make_single_program(algorithm: Algorithm, iterations_per_call: int, fused: b
         merge=lambda states: states[0],
         policies=lambda state: [algorithm.policy_params(state)],
         split_metrics=lambda metrics: [jax.device_get(metrics)],
-        is_finite=lambda state: np.atleast_1d(is_finite(state)),
+        is_finite=lambda state: np.atleast_1d(check(state)),
         max_over_processes=lambda number: number,
     )
 
@@ -112,7 +112,7 @@ def make_axis_program(
     max_over_processes: Callable[[int], int] = lambda number: number,
 ) -> Program:
     """A program whose state has an axis of runs in front."""
-    is_finite = jax.jit(jax.vmap(functools.partial(has_finite_policy, algorithm)))
+    check = jax.jit(jax.vmap(is_finite))
 
     def policies(state: TrainState) -> list[Any]:
         params = algorithm.policy_params(state)
@@ -133,15 +133,9 @@ def make_axis_program(
         merge=merge,
         policies=policies,
         split_metrics=split_metrics,
-        is_finite=lambda state: np.asarray(is_finite(state)),
+        is_finite=lambda state: np.asarray(check(state)),
         max_over_processes=max_over_processes,
     )
-
-
-def has_finite_policy(algorithm: Algorithm, state: TrainState) -> jax.Array:
-    """Whether every parameter of the policy is finite, `[] bool`."""
-    leaves = jax.tree.leaves(algorithm.policy_params(state))
-    return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in leaves]))
 
 
 def _split_metrics(num_runs: int, metrics: Metrics) -> list[Metrics]:

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import numpy as np
+import jax.numpy as jnp
 
-from mjx_walk.algos import TrainState, make_algorithm
+from mjx_walk.algos import TrainState, learned_leaves, make_algorithm
 from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
 from mjx_walk.runs.checkpoint import list_steps
@@ -103,7 +103,7 @@ class Trainer:
             None at the end, otherwise the name of the signal. The states are saved in both cases.
 
         Raises:
-            UserError: training has diverged, so that a policy is not finite.
+            UserError: training has diverged, so that a network, an optimizer or a running statistic is not finite.
         """
         state, call = self._start()
         progress = Progress(self.num_calls * self.steps_per_call, call * self.steps_per_call)
@@ -111,14 +111,14 @@ class Trainer:
         self._times.append((time.monotonic(), call))
         for recorder in self.recorders:
             recorder.begin(call * self.steps_per_call, will_train=call < self.num_calls)
-        diverged: list[int] = []
+        diverged = False
         with Interrupt() as interrupt:
             while call < self.num_calls and not self._stop_signal(interrupt) and not diverged:
                 state, metrics = self._program.step(state)
                 call += 1
                 rows = self._rows(call, metrics)  # waits for the call, so that the row has its end time
                 self._write(state, rows, progress)
-                diverged = self._diverged(state)
+                diverged = not self._program.is_finite(state).all()
                 if call % self.config.checkpoint.every_calls == 0:
                     self._save(state, call)
                     saved_call = call
@@ -129,9 +129,9 @@ class Trainer:
         self._end(state, call, is_stopped=bool(signal_name or diverged))
         if diverged:
             raise UserError(
-                f"training has diverged: after {call * self.steps_per_call:,} steps the policy of seed "
-                f"{', '.join(map(str, diverged))} is not finite; earlier checkpoints are kept; "
-                "lower the learning rate or clip gradients, then resume or start a new run"
+                f"training has diverged: after {call * self.steps_per_call:,} steps {self._nonfinite(state)} is not "
+                "finite; earlier checkpoints are kept; lower the learning rate or clip gradients, then resume or start "
+                "a new run"
             )
         return signal_name
 
@@ -230,16 +230,19 @@ class Trainer:
         return self._seconds_before + time.monotonic() - self._started
 
     def _save(self, state: TrainState, call: int) -> None:
-        """Save the TrainState of every run whose policy is finite."""
+        """Save the TrainState of every run that is finite."""
         states = zip(self.recorders, self._program.split(state), self._program.is_finite(state), strict=True)
         for recorder, own, is_finite in states:
             if is_finite:
                 recorder.save(own, call * self.steps_per_call, self._seconds())
 
-    def _diverged(self, state: TrainState) -> list[int]:
-        """Seeds of the runs whose policy is not finite."""
-        seeds = np.array([recorder.config.seed for recorder in self.recorders])
-        return sorted(seeds[~self._program.is_finite(state)].tolist())
+    def _nonfinite(self, state: TrainState) -> str:
+        """The first learned leaf that is not finite, and its seed, for each run that has one."""
+        found = []
+        for recorder, own in zip(self.recorders, self._program.split(_without_replay(state)), strict=True):
+            names = [name for name, leaf in learned_leaves(own).items() if not jnp.isfinite(leaf).all()]
+            found += [f"{name} of seed {recorder.config.seed}" for name in names[:1]]
+        return ", ".join(found)
 
     def _stop_signal(self, interrupt: Interrupt) -> str | None:
         """Name of the stop signal, from whichever process received it."""

@@ -21,7 +21,7 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mjx_walk.utils.compat import exempt_imports_from_gc, prepare_jax
+from mjx_walk.utils.compat import exempt_imports_from_gc, prepare_jax, standard_settings
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import check_replaceable
 from mjx_walk.utils.settings import validate
@@ -186,7 +186,7 @@ def main(command: Callable[[list[str]], int | None]) -> NoReturn:
 
     Invalid input, a full or read-only disk, and Ctrl-C print one line instead of a traceback.
     """
-    with _console():
+    with _console(), standard_settings():
         exempt_imports_from_gc()
         prepare_jax()
         sys.exit(_exit_code_of(command))

@@ -10,7 +10,14 @@ from pathlib import Path
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-__all__ = ["default_cache_dir", "exempt_imports_from_gc", "prepare_jax", "temporary_jax_settings"]
+__all__ = [
+    "default_cache_dir",
+    "exempt_imports_from_gc",
+    "prepare_jax",
+    "standard_dtypes",
+    "standard_settings",
+    "temporary_jax_settings",
+]
 
 _FUSION_TYPE = "--xla_cpu_experimental_ynn_fusion_type"
 
@@ -43,8 +50,31 @@ def _has_started() -> bool:
 
 
 @contextlib.contextmanager
+def standard_dtypes() -> Iterator[None]:
+    """Trace and run with 32-bit numbers and JAX's usual promotion, also under `JAX_ENABLE_X64=1`.
+
+    It is a context manager and a decorator, and may stand inside a program of the caller with 64-bit numbers.
+    """
+    with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+@contextlib.contextmanager
+def standard_settings() -> Iterator[None]:
+    """`standard_dtypes`, and JAX's usual random numbers: a run's leaves and results are the same in every process."""
+    with (
+        standard_dtypes(),
+        jax.default_prng_impl("threefry2x32"),
+        jax.enable_custom_prng(False),
+        jax.legacy_prng_key("allow"),
+        jax.threefry_partitionable(True),
+    ):
+        yield
+
+
+@contextlib.contextmanager
 def temporary_jax_settings(matmul_precision: str) -> Iterator[None]:
-    """Compile with a matrix product precision and a compilation cache, and restore the caller's settings at the end.
+    """Compile with standard settings, a matrix product precision and a compilation cache, until the block ends.
 
     A cache folder that the caller has chosen, by `JAX_COMPILATION_CACHE_DIR` or `jax.config`, stays.
 
@@ -52,7 +82,7 @@ def temporary_jax_settings(matmul_precision: str) -> Iterator[None]:
         matmul_precision: a value of `jax_default_matmul_precision`.
     """
     has_cache = jax.config.jax_compilation_cache_dir is not None  # type: ignore[attr-defined]
-    with jax.default_matmul_precision(matmul_precision):
+    with standard_settings(), jax.default_matmul_precision(matmul_precision):
         if has_cache:
             yield
             return

@@ -7,6 +7,7 @@ from typing import Any
 
 import flax
 import jax
+import jax.numpy as jnp
 from brax.training.types import Transition
 
 __all__ = [
@@ -42,11 +43,20 @@ class Reduction(enum.Enum):
 
 
 class Metric(flax.struct.PyTreeNode):
-    """A number that is logged. NaN stands for an iteration without a value."""
+    """A number that is logged."""
 
     value: jax.Array
     """`[] f32` of one iteration, `[iterations] f32` of several."""
     reduction: Reduction = flax.struct.field(pytree_node=False)
+    has_value: jax.Array | None = None
+    """Whether an iteration has a value, a bool in the shape of `value`; None if every iteration has one.
+
+    NaN does not stand for a missing value, because `JAX_DEBUG_NANS=1` stops at every NaN."""
+
+    def only_if(self, condition: jax.Array) -> "Metric":
+        """The metric with a value only where a condition, `[] bool`, holds too."""
+        has_value = condition if self.has_value is None else condition & self.has_value
+        return self.replace(value=jnp.where(has_value, self.value, 0.0), has_value=has_value)
 
 
 Metrics = dict[str, Metric]

@@ -33,7 +33,7 @@ def renew(env, state, evaluation, key, iteration):
     """A new pool, and the next round of the evaluation if one has ended."""
     state = env.renew_pool(state, key)
     evaluation, scores = env.evaluator.next_round(evaluation, (), jnp.int32(iteration), state.pool)
-    return state, evaluation, values(scores)
+    return state, evaluation, scores
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_a_round_of_evaluation_is_not_begun_too_early(walker):
     evaluation = evaluation.replace(alive=jnp.zeros(2, bool))
     for update, is_told in ((11, False), (12, False), (13, True)):
         _, _, scores = renew(env, state, evaluation, jax.random.PRNGKey(1), update)
-        assert np.isfinite(scores["eval_return"]) == is_told
+        assert scores["eval_return"].has_value == is_told
 
 
 def test_inline_evaluation_equals_an_evaluation_on_its_own(walker):
@@ -136,11 +136,12 @@ def test_inline_evaluation_equals_an_evaluation_on_its_own(walker):
     assert not evaluation.alive.any()
     np.testing.assert_allclose(evaluation.returns, expected, rtol=1e-5)
     state, evaluation, scores = renew(env, state, evaluation, jax.random.PRNGKey(1), 7)
-    assert scores["eval_return"] == pytest.approx(np.mean(expected), rel=1e-5) and scores["eval_iteration"] == 0
-    assert evaluation.best_return == scores["eval_return"] and evaluation.snapshot_iteration == 7
+    assert scores["eval_return"].value == pytest.approx(np.mean(expected), rel=1e-5)
+    assert scores["eval_iteration"].value == 0
+    assert evaluation.best_return == scores["eval_return"].value and evaluation.snapshot_iteration == 7
     assert evaluation.alive.all()
     _, _, unfinished = renew(env, state, evaluation, jax.random.PRNGKey(2), 8)
-    assert np.isnan(unfinished["eval_return"])
+    assert scores["eval_return"].has_value and not unfinished["eval_return"].has_value
 
 
 def test_the_best_policy_is_the_one_that_was_scored_best(walker):

@@ -17,12 +17,17 @@ OBSERVATION = np.linspace(-1.0, 1.0, 17, dtype=np.float32)
 
 @pytest.mark.parametrize("algo", sorted(path.name for path in OLD_RUNS.iterdir() if path.is_dir()))
 def test_an_old_run_loads_acts_and_resumes(algo, tmp_path):
-    """`expected` holds an action, and the leaves after two more iterations, by their old names."""
+    """`expected` holds an action, and the leaves after two more iterations, by their old names.
+
+    They resume under `JAX_DEBUG_NANS=1`, which stops at any NaN, and under `JAX_ENABLE_X64=1`.
+    """
     run_dir = shutil.copytree(OLD_RUNS / algo, tmp_path / "run")
     expected = flax.serialization.msgpack_restore(gzip.decompress((run_dir / "expected.msgpack.gz").read_bytes()))
-    run = mjx_walk.load_run(run_dir)
+    with jax.enable_x64(True):
+        run = mjx_walk.load_run(run_dir)
     np.testing.assert_allclose(run.policy(OBSERVATION), expected["action"], atol=1e-5)
-    train_here(run_dir, "resume=true", "total_steps=32", tiny=[])
+    with jax.debug_nans(True), jax.enable_x64(True):
+        train_here(run_dir, "resume=true", "total_steps=32", tiny=[])
     newest = checkpoint.list_steps(run_dir / "checkpoints")[-1]
     like = jax.eval_shape(run.algorithm.init, jax.random.PRNGKey(0))
     found, facts = checkpoint.restore(newest, like)

@@ -79,7 +79,9 @@ def test_a_reward_that_is_not_finite_warns_once(tmp_path, monkeypatch, caplog):
 def test_training_that_diverges_stops_and_keeps_what_was_saved_before(tmp_path):
     run, steps = tmp_path / "run", f"total_steps={50 * TINY_CALL}"
     arguments = [*TINY, f"run_dir={run}", "checkpoint.every_calls=1", steps]
-    with pytest.raises(UserError, match=r"training has diverged: .* the policy of seed 0 is not finite"):
+    with pytest.raises(
+        UserError, match=r"training has diverged: after 128 steps params\.policy\..* of seed 0 is not finite"
+    ):
         train_command.main([*arguments, "algo.learning_rate=1e30"])
     assert 1 <= len((run / "metrics.jsonl").read_text().splitlines()) <= 3
     # PPO learns nothing from the first batch, so the checkpoint after it is finite. The second batch diverges.
@@ -88,21 +90,21 @@ def test_training_that_diverges_stops_and_keeps_what_was_saved_before(tmp_path):
     assert all(np.isfinite(np.asarray(leaf, np.float64)).all() for leaf in jax.tree.leaves(policy_params))
 
 
-def test_only_seeds_with_a_finite_policy_are_saved(tmp_path, monkeypatch):
-    """The second one's policy is broken from the start."""
+def test_only_seeds_whose_networks_are_finite_are_saved(tmp_path, monkeypatch):
+    """The second one's value network is broken from the start."""
 
     def broken(init):
         init = make_init(init)
 
         def break_second(key):
             state = init(key)
-            policy = jax.tree.map(lambda x: x.at[1].set(jnp.nan), state.params.policy)
-            return state.replace(params=state.params.replace(policy=policy))
+            value = jax.tree.map(lambda x: x.at[1].set(jnp.inf), state.params.value)
+            return state.replace(params=state.params.replace(value=value))
 
         return break_second
 
     monkeypatch.setattr(programs, "make_init", broken)
-    with pytest.raises(UserError, match="the policy of seed 5 is not finite"):
+    with pytest.raises(UserError, match=r"64 steps params\.value\.\S+ of seed 5 is not finite"):
         train_command.main([*TINY, f"run_dir={tmp_path}", "seeds=[3,5]", f"total_steps={50 * TINY_CALL}"])
     assert len(list((tmp_path / "seed_3" / "checkpoints").glob("0*"))) == 1
     assert not list((tmp_path / "seed_5" / "checkpoints").iterdir())

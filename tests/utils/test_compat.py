@@ -6,6 +6,7 @@ import sys
 import warnings
 
 import jax
+import jax.numpy as jnp
 import pytest
 from helpers import ENVIRONMENT, TINY, TINY_CALL
 
@@ -16,7 +17,8 @@ FLAG = "--xla_cpu_experimental_ynn_fusion_type"
 
 
 def settings_of_process():
-    return dict(jax.config.values), jax.config.jax_default_matmul_precision, dict(os.environ)
+    environment = {name: value for name, value in os.environ.items() if name != "CRC32C_SW_MODE"}  # by tensorboardX
+    return dict(jax.config.values), jax.config.jax_default_matmul_precision, environment
 
 
 @pytest.mark.parametrize("chosen", [None, "own"])
@@ -30,8 +32,10 @@ def test_a_run_leaves_the_settings_of_its_caller(chosen, tmp_path, monkeypatch):
         with jax.default_matmul_precision("bfloat16"), temporary_jax_settings("float32"):
             assert jax.config.jax_default_matmul_precision == "float32"
             assert jax.config.jax_compilation_cache_dir == (own or str(tmp_path / "user" / "mjx_walk" / "jax"))
-        mjx_walk.run([*TINY, f"run_dir={tmp_path}/run", f"total_steps={TINY_CALL}"])
+        with jax.enable_x64(True), jax.default_prng_impl("rbg"), jax.numpy_rank_promotion("raise"):
+            run = mjx_walk.run([*TINY, f"run_dir={tmp_path}/run", f"total_steps={TINY_CALL}"])
         assert settings_of_process() == before
+        assert not {leaf.dtype for leaf in jax.tree.leaves(run.policy_params)} & {jnp.dtype("f8"), jnp.dtype("i8")}
     finally:
         jax.config.update("jax_compilation_cache_dir", former)
 
@@ -92,3 +96,29 @@ def test_no_test_runs_without_the_flag():
         warnings.simplefilter("error")
         mjx_walk.prepare_jax()
     assert FLAG in os.environ["XLA_FLAGS"]
+
+
+@pytest.mark.parametrize(("physics", "is_compiled_alone"), [("c", False), ("c", True), ("jax", False)])
+def test_a_task_keeps_its_dtypes_inside_a_program_with_64_bits(physics, is_compiled_alone):
+    """Traced, not run. A `scan` needs the same dtypes in and out."""
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        task = mjx_walk.make_env("inverted_pendulum", physics=physics)
+        step = jax.jit(task.step) if is_compiled_alone else task.step
+
+        def play(keys):
+            state = jax.vmap(task.reset)(keys)
+            actions = jnp.zeros((2, 3, 1))
+            assert actions.dtype == jnp.float64
+            return jax.lax.scan(lambda state, action: (jax.vmap(step)(state, action), state.obs), state, actions)
+
+        state, obs = jax.eval_shape(play, jax.random.split(jax.random.PRNGKey(0), 3))
+    assert {str(leaf.dtype) for leaf in jax.tree.leaves((state, obs))} == {"float32", "int32", "bool"}
+
+
+def test_a_policy_of_the_zoo_acts_alike_with_64_bits():
+    actions = []
+    for has_64_bits in (False, True):
+        with jax.enable_x64(has_64_bits):
+            run = mjx_walk.load_run("zoo:walker2d-td3", physics="c")
+            actions.append(run.policy(jnp.linspace(-1.0, 1.0, 17)))
+    assert actions[0].dtype == actions[1].dtype == "float32" and (actions[0] == actions[1]).all()
