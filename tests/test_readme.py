@@ -117,13 +117,13 @@ def small_run(tmp_path_factory):
 
 
 def sizes(arguments):
-    """Those of a small run that the algorithm, if there is only one, has and the arguments do not give."""
+    """Those of a small run that the algorithm has and the arguments do not give. Several algorithms have none."""
+    if any(re.match(r"algo=.*,", argument) for argument in arguments):
+        return []
     of_the_command = ("-", "hydra.", "seeds=", "devices=")
     first_job = [re.sub(r",.*", "", argument) for argument in arguments if not argument.startswith(of_the_command)]
     config = load_config([*first_job, "run_dir=null"])
-    have = {"num_envs", "evaluation.num_envs"}
-    if not any(re.match(r"algo=.*,", argument) for argument in arguments):
-        have |= {f"algo.{field.name}" for field in dataclasses.fields(config.algo)}
+    have = {f"algo.{field.name}" for field in dataclasses.fields(config.algo)} | {"num_envs", "evaluation.num_envs"}
     given = {argument.split("=")[0] for argument in arguments}
     tiny = TINY if isinstance(config.algo, OnPolicyConfig) else TINY_OFF_POLICY
     return [setting for setting in tiny if setting.split("=")[0] in have - given]
