@@ -1,6 +1,7 @@
 """Run the commands as a user does, small."""
 
 import contextlib
+import dataclasses
 import os
 import re
 import runpy
@@ -14,6 +15,7 @@ import orbax.checkpoint as ocp
 import pytest
 
 from mjx_walk.algos import ALGORITHMS
+from mjx_walk.algos.on_policy import OnPolicyConfig
 from mjx_walk.envs import registry
 from mjx_walk.runs import checkpoint
 from mjx_walk.utils.errors import UserError
@@ -51,6 +53,25 @@ TINY_OFF_POLICY = (
     "algo.critic_hidden_layer_sizes=[32,32]",
     "checkpoint.every_calls=2",
 )
+_SMALL_ON_POLICY = {
+    "unroll_length": 4,
+    "num_unrolls": 1,
+    "normalizer_warmup_steps_per_env": 4,
+    "num_minibatches": 2,
+    "max_tail_discount": 0.95,
+    "policy_hidden_layer_sizes": (4,),
+    "value_hidden_layer_sizes": (4,),
+}
+_SMALL_OFF_POLICY = {
+    "unroll_length": 2,
+    "grad_updates_per_step": 1,
+    "policy_delay": 1,
+    "batch_size": 4,
+    "replay_capacity": 64,
+    "learning_starts": 8,
+    "policy_hidden_layer_sizes": (4,),
+    "critic_hidden_layer_sizes": (4,),
+}
 OPTIMIZED = {"xla_backend_optimization_level": 1}
 """Options of `jax.jit` for programs that take longer to run than to compile; see `conftest`."""
 
@@ -124,6 +145,14 @@ def command_here(module: str, *arguments: str) -> int:
         with pytest.raises(SystemExit) as ended:
             runpy.run_module(f"mjx_walk.{module}", run_name="__main__", alter_sys=True)
     return ended.value.code
+
+
+def small_settings(algo, **further):
+    """Settings of an algorithm that make an iteration small, and further ones."""
+    config = ALGORITHMS[algo][1]
+    small = _SMALL_ON_POLICY if issubclass(config, OnPolicyConfig) else _SMALL_OFF_POLICY
+    names = {field.name for field in dataclasses.fields(config)}
+    return {name: value for name, value in small.items() if name in names} | further
 
 
 def leaves(run_dir, call):

@@ -117,7 +117,10 @@ def small_run(tmp_path_factory):
 
 
 def sizes(arguments):
-    """Those of a small run that the algorithm has and the arguments do not give. Several algorithms have none."""
+    """Sizes of a small run, where the algorithm has them and the arguments give no other.
+
+    A sweep over algorithms, which differ in what they have, keeps the sizes of its recipes.
+    """
     if any(re.match(r"algo=.*,", argument) for argument in arguments):
         return []
     of_the_command = ("-", "hydra.", "seeds=", "devices=")

@@ -1,10 +1,9 @@
 """What every algorithm's state has in common."""
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
+from helpers import small_settings
 from toy_tasks import EndlessReward
 
 from mjx_walk.algos import ALGORITHMS, is_finite, learned_leaves, make_algorithm
@@ -24,18 +23,7 @@ PARTS = {
 
 def state_of_zeros(algo):
     """The state of an algorithm with small networks, without running or compiling its `init`."""
-    small = {
-        "num_minibatches": 1,
-        "max_tail_discount": 0.999,
-        "replay_capacity": 64,
-        "learning_starts": 8,
-        "policy_hidden_layer_sizes": (4,),
-        "critic_hidden_layer_sizes": (4,),
-        "value_hidden_layer_sizes": (4,),
-    }
-    config = ALGORITHMS[algo][1]()
-    known = {field.name for field in dataclasses.fields(config)} & small.keys()
-    config = dataclasses.replace(config, **{name: small[name] for name in known})
+    config = ALGORITHMS[algo][1](**small_settings(algo))
     algorithm = make_algorithm(EndlessReward(), 4, EvaluationConfig(num_envs=2), config)
     shapes = jax.eval_shape(algorithm.init, jax.random.PRNGKey(0))
     return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)

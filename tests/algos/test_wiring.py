@@ -12,6 +12,7 @@ import re
 import jax
 import numpy as np
 import pytest
+from helpers import small_settings
 from jax.interpreters import partial_eval
 from toy_tasks import EndlessReward
 
@@ -19,28 +20,6 @@ from mjx_walk.algos import ALGORITHMS, make_algorithm
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.settings import has_effect
 
-ON_POLICY = ("ppo", "a2c", "reinforce")
-_SMALL_ON_POLICY = {
-    "unroll_length": 4,
-    "num_unrolls": 1,
-    "normalizer_warmup_steps_per_env": 4,
-    "num_minibatches": 2,
-    "max_tail_discount": 0.95,
-    "policy_hidden_layer_sizes": (4,),
-    "value_hidden_layer_sizes": (4,),
-}
-_SMALL_OFF_POLICY = {
-    "unroll_length": 2,
-    "grad_updates_per_step": 1,
-    "policy_delay": 1,
-    "batch_size": 4,
-    "replay_capacity": 64,
-    "learning_starts": 8,
-    "policy_hidden_layer_sizes": (4,),
-    "critic_hidden_layer_sizes": (4,),
-}
-BASE = {algo: _SMALL_ON_POLICY if algo in ON_POLICY else _SMALL_OFF_POLICY for algo in ALGORITHMS}
-"""Settings that make an iteration small, as far as an algorithm has them."""
 CHANGES = {
     "distribution": {"tanh_normal": "normal", "normal": "tanh_normal"},
     "activation": {"swish": "tanh", "relu": "tanh"},
@@ -73,8 +52,8 @@ NOT_TRACED = {
     **{(algo, "name"): "it selects the algorithm" for algo in ALGORITHMS},
     ("reinforce", "max_value_grad_norm"): "it adds an optimizer without parameters, which old checkpoints may hold",
 }
-FIRST_OF_THEIR_KIND = ("ppo", "a2c", "sac", "td3")
-"""The others are their subclasses, or share their base. For those, the settings that they inherit are slow tests."""
+ALL_SETTINGS_FAST = ("ppo", "a2c", "sac", "td3")
+"""They cover every base class. For the other algorithms, inherited settings are slow tests."""
 
 
 def cases():
@@ -82,13 +61,8 @@ def cases():
         own = config.__annotations__
         for field in dataclasses.fields(config):
             if (algo, field.name) not in NOT_TRACED:
-                marks = [] if algo in FIRST_OF_THEIR_KIND or field.name in own else [pytest.mark.slow]
+                marks = [] if algo in ALL_SETTINGS_FAST or field.name in own else [pytest.mark.slow]
                 yield pytest.param(algo, field.name, marks=marks, id=f"{algo}-{field.name}")
-
-
-def base_settings(algo, **further):
-    names = {field.name for field in dataclasses.fields(ALGORITHMS[algo][1])}
-    return {name: value for name, value in BASE[algo].items() if name in names} | further
 
 
 def changed(name, value):
@@ -114,7 +88,7 @@ def base_program(algo, needs):
 
 def program(algo, **settings):
     """The text of an iteration from a key to the state, without dead code, and its constants."""
-    config = ALGORITHMS[algo][1](**base_settings(algo, **settings))
+    config = ALGORITHMS[algo][1](**small_settings(algo, **settings))
     algorithm = make_algorithm(EndlessReward(), 4, EvaluationConfig(1), config)
     iteration = lambda key: algorithm.learn(*algorithm.collect(algorithm.init(key)))[0]  # noqa: E731
     traced = jax.make_jaxpr(iteration)(jax.random.PRNGKey(0))
@@ -127,7 +101,7 @@ def program(algo, **settings):
 def test_a_setting_changes_the_program_where_it_has_an_effect(algo, name):
     """With the settings that it needs, and without them."""
     for needs in [NEEDS[name], {}] if name in NEEDS else [{}]:
-        config = ALGORITHMS[algo][1](**base_settings(algo, **needs))
+        config = ALGORITHMS[algo][1](**small_settings(algo, **needs))
         value = changed(name, getattr(config, name))
         is_same = program(algo, **needs | {name: value}) == base_program(algo, tuple(needs.items()))
         assert is_same is not has_effect(config, name), needs
