@@ -87,7 +87,7 @@ def batch_once(batch_fn: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     @custom_vmap
-    @standard_dtypes()  # batched after the caller's own code was traced
+    @standard_dtypes()  # `vmap` may trace this after `Task.step` has returned
     def on_batch(*args):
         return batch_fn(*args)
 

@@ -53,7 +53,7 @@ def _has_started() -> bool:
 def standard_dtypes() -> Iterator[None]:
     """Trace and run with 32-bit numbers and JAX's usual promotion, also under `JAX_ENABLE_X64=1`.
 
-    It is a context manager and a decorator, and may stand inside a program of the caller with 64-bit numbers.
+    It is a context manager and a decorator. It may be used while the caller's own 64-bit program is traced.
     """
     with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
@@ -61,7 +61,7 @@ def standard_dtypes() -> Iterator[None]:
 
 @contextlib.contextmanager
 def standard_settings() -> Iterator[None]:
-    """`standard_dtypes`, and JAX's usual random numbers: a run's leaves and results are the same in every process."""
+    """`standard_dtypes`, and JAX's usual random numbers. The caller's settings then do not change a run."""
     with (
         standard_dtypes(),
         jax.default_prng_impl("threefry2x32"),
