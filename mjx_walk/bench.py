@@ -3,13 +3,15 @@
 import dataclasses
 import itertools
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import jax
 
 from mjx_walk.api import resolve
-from mjx_walk.experiments import profile, timing
+from mjx_walk.experiments import profile, scaling, timing
+from mjx_walk.experiments.timing import Measurement
 from mjx_walk.runs.config import Config
 from mjx_walk.runs.policies import make_task
 from mjx_walk.training import launcher
@@ -25,8 +27,8 @@ usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [KEY=VALUE ...] [secon
 
   KEY=VALUE  as for train: physics=jax num_envs=2048 algo.num_epochs=4; by default the recipe for this hardware
   seconds    time to measure each speed
-  devices    also measure training on 1, 2, 4 … GPUs of this host, up to this number: one process and num_envs
-             environments each
+  devices    measure instead how training scales over GPUs of this host: on 1, 2, 4 … up to this number, or on the
+             listed numbers (devices=[1,4]); first with num_envs environments on each, then with num_envs in all
   peers      also measure Brax's PPO (algo=ppo) or SAC (algo=sac) on Brax's own, reduced humanoid; this takes some
              minutes, mostly to compile
   out        write the table as JSON, with package versions
@@ -56,32 +58,43 @@ def main(command_line: list[str]) -> None:
     sizes = device_counts(arguments.devices)
     print("Short trainings in child processes …", flush=True)
     # They run first, before this process allocates the device's memory.
-    of_children = list(timing.measure(overrides, sizes, arguments.seconds))
+    if sizes:
+        results = _print(scaling.measure(overrides, config, sizes, arguments.seconds))
+    else:
+        first_calls = list(timing.measure_first_calls(overrides))
     task = make_task(config)
     device = f"{jax.devices()[0].device_kind}, physics={task.engine.name}, {config.num_envs} environments"
     print(f"{task.gymnasium_id} on {device}", flush=True)
-    measurements = itertools.chain(of_children, profile.measure(config, task, arguments.seconds))
+    if not sizes:
+        results = _print(itertools.chain(first_calls, profile.measure(config, task, arguments.seconds)))
     if arguments.peers:
         from mjx_walk.experiments import peers  # Brax's trainers take seconds to import
 
-        measurements = itertools.chain(measurements, peers.measure(algo, config.hardware))
-    results: dict[str, float] = {}
-    for name, value, unit in measurements:
-        results[name] = value
-        print(f"  {name:<44} {value:>12,.1f} {unit}", flush=True)
+        results |= _print(peers.measure(algo, config.hardware))
     if arguments.out:
         content = {"env": task.gymnasium_id, "device": device, "results": results, "versions": package_versions()}
         write_text(Path(arguments.out), json.dumps(content, indent=1))
 
 
+def _print(measurements: Iterable[Measurement]) -> dict[str, float]:
+    """Print each measurement as it comes, and return the values by name."""
+    results = {}
+    for name, value, unit in measurements:
+        results[name] = value
+        print(f"  {name:<48} {value:>12,.1f} {unit}", flush=True)
+    return results
+
+
 def device_counts(asked: Any) -> list[int]:
-    """Numbers of GPUs to measure: 1, 2, 4 … and the number asked for; none if no number is given.
+    """Numbers of GPUs to measure: 1, 2, 4 … and the number asked for, or the listed ones; none if none is asked for.
 
     Raises:
         UserError: this host has fewer GPUs.
     """
     if asked is None:
         return []
+    if isinstance(asked, list) and asked:
+        return sorted({launcher.count(size) for size in asked})
     most = launcher.count(asked)
     return sorted({most} | {2**power for power in range(most.bit_length())})
 

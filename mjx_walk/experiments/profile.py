@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 import resource
 import sys
 import time
@@ -12,13 +11,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from gymnasium.utils.performance import benchmark_step
-from jax.extend import core
 
 from mjx_walk.algos import Algorithm, TrainState, make_algorithm
 from mjx_walk.algos.off_policy import OffPolicyConfig
 from mjx_walk.common.replay_buffer import ReplayBuffer, Steps
 from mjx_walk.envs import Task
 from mjx_walk.envs.physics import make_engine
+from mjx_walk.experiments.program_costs import learning_flops
 from mjx_walk.experiments.timing import Measurement
 from mjx_walk.runs.config import Config
 from mjx_walk.training.programs import make_init, make_step
@@ -140,42 +139,6 @@ def _read_batch(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
     """Stand in for `learn`: read the batch, so that the compiler keeps it."""
     total = jnp.stack([jnp.sum(x, dtype=jnp.float32) for x in jax.tree.leaves(batch)]).sum()
     return state, as_means({"batch": total})
-
-
-def learning_flops(algorithm: Algorithm) -> float:
-    """Floating-point operations of the matrix products in one iteration."""
-    state = jax.eval_shape(algorithm.init, jax.random.PRNGKey(0))
-    return matmul_flops(algorithm.learn, *jax.eval_shape(algorithm.collect, state))
-
-
-def matmul_flops(function: Callable, *arguments: Any) -> float:
-    """Floating-point operations of the matrix products in one call.
-
-    Of a conditional's branches only the most expensive one counts. The body of a loop of unknown length counts once.
-
-    Args:
-        function: traceable.
-        arguments: arrays or their shapes.
-    """
-    return _count(jax.make_jaxpr(function)(*arguments).jaxpr)
-
-
-def _count(jaxpr: core.Jaxpr) -> float:
-    return sum(_count_equation(equation) for equation in jaxpr.eqns)
-
-
-def _count_equation(equation: core.JaxprEqn) -> float:
-    name, params = equation.primitive.name, equation.params
-    if name == "dot_general":
-        (contracted, _), _ = params["dimension_numbers"]
-        left: Any = equation.invars[0].aval
-        product: Any = equation.outvars[0].aval
-        return 2.0 * math.prod(product.shape) * math.prod(left.shape[axis] for axis in contracted)
-    if name == "cond":
-        return max(_count(branch.jaxpr) for branch in params["branches"])
-    bodies = [value.jaxpr if isinstance(value, core.ClosedJaxpr) else value for value in params.values()]
-    inner = sum(_count(body) for body in bodies if isinstance(body, core.Jaxpr))
-    return inner * params.get("length", 1) if name == "scan" else inner
 
 
 def matmul_speed(dtype: str, seconds: float) -> float:

@@ -12,7 +12,10 @@ from mjx_walk.utils.errors import UserError
 
 __all__ = ["MAY_DIFFER", "RunFolder", "differences", "new_path", "open_existing", "prepare"]
 
-MAY_DIFFER = ("run_dir", "resume", "total_steps", "algo.schedule_steps", "wandb_project", "evaluation.films")
+MAY_DIFFER = (
+    *("run_dir", "resume", "total_steps", "algo.schedule_steps"),
+    *("wandb_project", "evaluation.films", "profile_calls"),
+)
 """Settings that may change when a run is resumed."""
 
 
@@ -33,6 +36,10 @@ class RunFolder:
     @property
     def checkpoints(self) -> Path:
         return self.path / "checkpoints"
+
+    @property
+    def profile(self) -> Path:
+        return self.path / "profile"
 
     def policy(self, name: str) -> Path:
         """Folder of a kept policy, `final` or `best`."""

@@ -21,6 +21,7 @@ from mjx_walk.runs.config import Config
 from mjx_walk.runs.loggers import Progress
 from mjx_walk.runs.metrics import Row, name_metrics, physics_warnings
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.training.call_profile import CallProfile
 from mjx_walk.training.distributed import Processes, make_devices_program, per_device
 from mjx_walk.training.programs import Program, make_init, make_seeds_program, make_single_program
 from mjx_walk.training.recorder import Recorder
@@ -112,8 +113,10 @@ class Trainer:
         for recorder in self.recorders:
             recorder.begin(call * self.steps_per_call, will_train=call < self.num_calls)
         diverged = False
-        with Interrupt() as interrupt:
+        profiled = self.config.profile_calls if self._processes.is_main_process else 0
+        with Interrupt() as interrupt, CallProfile(self._folders[0].profile, profiled) as profile:
             while call < self.num_calls and not self._stop_signal(interrupt) and not diverged:
+                profile.next_call()
                 state, metrics = self._program.step(state)
                 call += 1
                 rows = self._rows(call, metrics)  # waits for the call, so that the row has its end time

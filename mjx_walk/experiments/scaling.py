@@ -1,0 +1,108 @@
+"""Speed of one training on several GPUs of a host, next to its speed on one."""
+
+import functools
+import signal
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from mjx_walk.algos import make_algorithm
+from mjx_walk.algos.off_policy import OffPolicyConfig
+from mjx_walk.experiments.program_costs import reduced_bytes
+from mjx_walk.experiments.recorded_time import read_device_time
+from mjx_walk.experiments.timing import Measurement, training
+from mjx_walk.runs.config import Config
+from mjx_walk.runs.metrics import Row
+from mjx_walk.runs.policies import make_task
+from mjx_walk.training.call_profile import CALLS_BEFORE
+from mjx_walk.utils.collectives import DEVICES
+from mjx_walk.utils.errors import UserError
+
+_RECORDED_CALLS = 2
+_UNTIMED_ROWS = CALLS_BEFORE + _RECORDED_CALLS + 1
+"""The call after the recorded ones is delayed, because the recording is written."""
+_MIN_CALLS = 3
+_ENDLESS = 10**12
+
+
+class Speed(NamedTuple):
+    """Speed of a training, and what the first device does during a call."""
+
+    steps_per_second: float
+    """Environment steps of all devices."""
+    call_seconds: float
+    reductions_seconds: float
+    """Reductions over devices in a recorded call."""
+    physics_seconds: float
+    """Warp's kernels in a recorded call."""
+
+
+def measure(overrides: list[str], config: Config, sizes: list[int], seconds: float) -> Iterator[Measurement]:
+    """Measure each number of GPUs, first with the recipe's environments on each, then with the recipe's in total.
+
+    Args:
+        overrides: as for `train`.
+        config: the same, composed.
+        sizes: numbers of GPUs of this host.
+        seconds: least time to measure each speed.
+
+    Raises:
+        UserError: training rejects these settings, or the environments or the batch are no multiple of a size.
+        RuntimeError: training failed.
+    """
+    shares = {size: share_of_total(config, size) for size in sizes if size > 1}
+    alone = None
+    for size in sizes:
+        for settings in ([], shares[size]) if size > 1 else ([],):
+            speed = measure_speed([*overrides, *settings], size, seconds)
+            alone = speed.steps_per_second if size == 1 else alone
+            num_envs = config.num_envs // size if settings else config.num_envs
+            yield from _measurements(f"{size} x {num_envs} environments", speed, alone if size > 1 else None)
+    if shares:
+        # Only now, because this process would allocate the devices' memory.
+        algorithm = make_algorithm(
+            make_task(config), config.num_envs, config.evaluation, config.algo, axis_name=DEVICES
+        )
+        megabytes = reduced_bytes(algorithm, max(sizes)) / 1e6
+        yield Measurement("data to reduce in an iteration, per device", megabytes, "MB")
+
+
+def share_of_total(config: Config, size: int) -> list[str]:
+    """Settings with which `size` devices together have the environments, batch and replay of one.
+
+    Raises:
+        UserError: they cannot be divided.
+    """
+    totals = {"num_envs": config.num_envs}
+    if isinstance(config.algo, OffPolicyConfig):
+        totals |= {"algo.batch_size": config.algo.batch_size, "algo.replay_capacity": config.algo.replay_capacity}
+    for name in ("num_envs", "algo.batch_size"):
+        if totals.get(name, size) % size:
+            raise UserError(f"{name}={totals[name]} is no multiple of {size} devices")
+    return [f"{name}={total // size}" for name, total in totals.items()]
+
+
+def measure_speed(overrides: list[str], size: int, seconds: float) -> Speed:
+    """Train on `size` devices, with the overrides' environments on each, until enough calls are logged."""
+    arguments = [*overrides, f"total_steps={_ENDLESS}", f"devices={size}", f"profile_calls={_RECORDED_CALLS}"]
+    with training(arguments, functools.partial(_are_enough, seconds), signal.SIGTERM) as (rows, run_dir):
+        recorded = read_device_time(run_dir / "profile")
+    timed = rows[_UNTIMED_ROWS - 1 :]
+    steps, time_taken = (timed[-1][name] - timed[0][name] for name in ("env_steps", "wall_seconds"))
+    parts = (part / _RECORDED_CALLS for part in recorded)
+    return Speed(steps / time_taken, time_taken / (len(timed) - 1), *parts)
+
+
+def _are_enough(seconds: float, rows: list[Row]) -> bool:
+    """Whether the timed rows span enough calls and time."""
+    timed = rows[_UNTIMED_ROWS - 1 :]
+    return len(timed) > _MIN_CALLS and timed[-1]["wall_seconds"] - timed[0]["wall_seconds"] >= seconds
+
+
+def _measurements(name: str, speed: Speed, alone: float | None) -> Iterator[Measurement]:
+    yield Measurement(f"training, {name}", speed.steps_per_second, "env-steps/s")
+    if alone:
+        yield Measurement(f"  {name}: times one device", speed.steps_per_second / alone, "times")
+    yield Measurement(f"  {name}: a call", speed.call_seconds * 1e3, "ms")
+    yield Measurement(f"  {name}: physics in a call", speed.physics_seconds * 1e3, "ms")
+    yield Measurement(f"  {name}: reductions in a call", speed.reductions_seconds * 1e3, "ms")
+    yield Measurement(f"  {name}: share of reductions", 100 * speed.reductions_seconds / speed.call_seconds, "%")

@@ -1,0 +1,44 @@
+"""Record a few calls of a training with JAX's profiler."""
+
+from pathlib import Path
+from typing import Self
+
+import jax
+
+CALLS_BEFORE = 2
+"""The first call compiles the training's programs, and the programs that read its results compile after it."""
+
+
+class CallProfile:
+    """Records program calls from the third one on, and writes the recording before the next call or on exit."""
+
+    def __init__(self, folder: Path, num_calls: int):
+        """
+        Args:
+            folder: where to write the recording, for TensorBoard and Perfetto.
+            num_calls: number of calls to record; 0 records none.
+        """
+        self._folder, self._num_calls = folder, num_calls
+        self._calls, self._is_recording = 0, False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop()
+
+    def next_call(self) -> None:
+        """Start or end the recording where it is due. The previous call must have ended on the device."""
+        if self._calls == CALLS_BEFORE + self._num_calls:
+            self._stop()
+        elif self._calls == CALLS_BEFORE:
+            options = jax.profiler.ProfileOptions()
+            options.python_tracer_level = 0  # it would slow the host down
+            jax.profiler.start_trace(self._folder, profiler_options=options)
+            self._is_recording = True
+        self._calls += 1
+
+    def _stop(self) -> None:
+        if self._is_recording:
+            self._is_recording = False
+            jax.profiler.stop_trace()
