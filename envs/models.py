@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Int
 
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import user_path
 from mjx_walk.utils.quiet_mujoco import hide_deprecations
 
 _LOGGER = logging.getLogger(__name__)
@@ -29,7 +30,7 @@ class ModelNeeds(NamedTuple):
 
 def model_path(xml_file: str) -> Path:
     """Path of a model. A bare name is one of Gymnasium's assets, even if the working directory has such a file."""
-    path = Path(xml_file).expanduser()
+    path = user_path(xml_file)
     if len(path.parts) == 1:
         return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / xml_file
     return path
@@ -47,6 +48,8 @@ def load_model(xml_file: str) -> mujoco.MjModel:
     path = model_path(xml_file)
     if not path.is_file():
         raise UserError(f"model file not found: {path}")
+    if "\\" in str(path):
+        raise UserError(f"MuJoCo cannot open {path}: it takes the backslash for a separator; choose another path")
     try:
         with hide_deprecations():
             return mujoco.MjModel.from_xml_path(str(path))

@@ -9,6 +9,7 @@ from mjx_walk.envs.reward_shaping import Shaping
 from mjx_walk.envs.state import NO_TIME_LIMIT
 from mjx_walk.envs.user_files import absolute_source
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import user_path
 from mjx_walk.utils.settings import setting
 
 
@@ -85,8 +86,8 @@ def with_absolute_paths(options: TaskOptions, folder: Path) -> TaskOptions:
         folder: what a relative path is relative to.
     """
     xml_file, source = options.xml_file, options.reward_function
-    if xml_file and (folder / Path(xml_file).expanduser()).is_file():
-        xml_file = str((folder / Path(xml_file).expanduser()).resolve())
+    if xml_file and (folder / user_path(xml_file)).is_file():
+        xml_file = str((folder / user_path(xml_file)).resolve())
     source = absolute_source(source, folder) if source else source
     task = absolute_source(options.task, folder) if options.task else None
     return dataclasses.replace(options, xml_file=xml_file, reward_function=source, task=task)

@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import user_path
 
 __all__ = [
     "UserFile",
@@ -36,7 +37,7 @@ _known: dict[Path, Mapping[str, str]] = {}
 
 def source_path(source: str) -> Path:
     """Absolute path of the file in `PATH.py:FUNCTION`."""
-    return Path(os.path.abspath(Path(source.rpartition(":")[0]).expanduser()))
+    return Path(os.path.abspath(user_path(source.rpartition(":")[0] or ".")))
 
 
 def absolute_source(source: str, folder: Path) -> str:
@@ -47,7 +48,7 @@ def absolute_source(source: str, folder: Path) -> str:
         folder: what a relative path is relative to.
     """
     path, colon, name = source.rpartition(":")
-    return f"{os.path.abspath(folder / Path(path).expanduser())}:{name}" if colon else source
+    return f"{os.path.abspath(folder / user_path(path or '.'))}:{name}" if colon else source
 
 
 def changed_file(hashes: Mapping[str, str]) -> str | None:

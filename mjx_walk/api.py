@@ -188,7 +188,8 @@ def _score(trainer: Trainer, folders: list[RunFolder]) -> None:
     except KeyboardInterrupt:
         for folder in folders:
             if not folder.gymnasium_scores.exists():
-                _LOGGER.info("Trained and saved, not scored. To score: python -m mjx_walk.eval run=%s", folder.path)
+                where = shlex.quote(f"run={folder.path}")
+                _LOGGER.info("Trained and saved, not scored. To score: python -m mjx_walk.eval %s", where)
         raise
 
 

@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import json
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,7 +16,7 @@ from mjx_walk.runs.policies import make_task
 from mjx_walk.training import launcher
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import write_text
+from mjx_walk.utils.files import user_path, write_text
 from mjx_walk.utils.settings import setting
 from mjx_walk.utils.versions import package_versions
 
@@ -54,7 +53,7 @@ def main(command_line: list[str]) -> None:
         raise UserError(f"Brax has no {algo} to compare with; omit peers, or choose algo=ppo or algo=sac")
     jax.config.update("jax_default_matmul_precision", config.matmul_precision)
     if arguments.out:
-        cli.check_writable(Path(arguments.out))
+        cli.check_writable(user_path(arguments.out))
     sizes = device_counts(arguments.devices)
     print("Short trainings in child processes …", flush=True)
     # They run first, before this process allocates the device's memory.
@@ -73,7 +72,7 @@ def main(command_line: list[str]) -> None:
         results |= _print(peers.measure(algo, config.hardware))
     if arguments.out:
         content = {"env": task.gymnasium_id, "device": device, "results": results, "versions": package_versions()}
-        write_text(Path(arguments.out), json.dumps(content, indent=1))
+        write_text(user_path(arguments.out), json.dumps(content, indent=1))
 
 
 def _print(measurements: Iterable[Measurement]) -> dict[str, float]:

@@ -18,6 +18,7 @@ from mjx_walk.runs.config import Config
 from mjx_walk.utils import cli
 from mjx_walk.utils.devices import count_devices
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import user_path
 from mjx_walk.utils.settings import setting
 from mjx_walk.utils.signals import exit_code
 
@@ -60,7 +61,7 @@ def main(command_line: list[str]) -> int:
     if arguments.draw:
         if arguments.out is None:
             raise UserError("say which runs to draw: out=DIR")
-        _print_report(Path(arguments.out))
+        _print_report(user_path(arguments.out))
         return 0
     if not arguments.algos:
         raise UserError(f"algos=[]: choose some of: {', '.join(ALGORITHMS)}")
@@ -115,7 +116,7 @@ def _on_end(out: Path, run: PlannedRun, log: Path) -> None:
 
 def _print_report(out: Path) -> None:
     report = write_report(out)
-    print(report.read_text(), end="")
+    print(report.read_text(encoding="utf-8"), end="")
     print(f"Written: {os.path.relpath(report)}, and .png and .csv of the same name")
 
 

@@ -1,7 +1,6 @@
 """`python -m mjx_walk.export run=RUN_DIR`: export a policy to a file that runs without JAX and this package."""
 
 import dataclasses
-from pathlib import Path
 
 from mjx_walk import zoo
 from mjx_walk.api import load_run
@@ -9,7 +8,7 @@ from mjx_walk.runs.own_tasks import take_task
 from mjx_walk.runs.scores import BEST, POLICIES
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import replacing
+from mjx_walk.utils.files import replacing, user_path
 from mjx_walk.utils.settings import setting
 
 USAGE = """
@@ -46,7 +45,7 @@ def main(command_line: list[str]) -> None:
     except ImportError as error:
         raise UserError("format=onnx needs ONNX: pip install onnx") from error
     run = load_run(folder.path, "c", arguments.policy)
-    path = Path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.onnx")
+    path = user_path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.onnx")
     cli.check_writable(path)
     name = f"{run.config.env.name}_{run.config.algo.name}"
     model = translate(run.act, run.task.observation_size, name, arguments.dtype)

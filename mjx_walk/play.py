@@ -1,7 +1,6 @@
 """`python -m mjx_walk.play run=RUN_DIR`: watch a policy in the real Gymnasium."""
 
 import dataclasses
-from pathlib import Path
 
 import imageio.v3 as iio
 
@@ -10,7 +9,7 @@ from mjx_walk.api import load_run
 from mjx_walk.runs.own_tasks import take_task
 from mjx_walk.runs.scores import BEST, POLICIES
 from mjx_walk.utils import cli
-from mjx_walk.utils.files import replacing
+from mjx_walk.utils.files import replacing, user_path
 from mjx_walk.utils.settings import setting
 from mjx_walk.viewing.episode import record_episode
 from mjx_walk.viewing.gait import draw_gait_sheet, frame_strip
@@ -58,7 +57,7 @@ def main(command_line: list[str]) -> None:
     if arguments.html:
         require_library()
     paths = (arguments.out, arguments.html, arguments.gait, arguments.strip)
-    film, html, gait, strip = (Path(path) if path else None for path in paths)
+    film, html, gait, strip = (user_path(path) if path else None for path in paths)
     if not (any(paths) or arguments.viewer):
         film = zoo.output_path(folder, "episode.mp4")
     cli.check_suffix(film, ".mp4", ".mkv", ".mov", ".avi")

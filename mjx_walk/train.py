@@ -20,18 +20,19 @@ from mjx_walk.envs import TASKS
 from mjx_walk.runs.config import (
     CONFIG_DIR,
     Config,
-    complete_overrides,
     compose_config,
     load_config,
     register_schemas,
     to_config,
     with_absolute_paths,
 )
+from mjx_walk.runs.overrides import complete_overrides
 from mjx_walk.runs.renamed import present_overrides
 from mjx_walk.training import launcher
 from mjx_walk.training.distributed import Processes, join_processes
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import user_path
 from mjx_walk.utils.settings import describe, refuse_ineffective
 from mjx_walk.utils.signals import Stopped, exit_code
 
@@ -129,7 +130,7 @@ def _through_hydra(arguments: list[str]) -> None:
     """
     given = [a for a in arguments if not a.startswith("-") and ("=" in a or a[0] in "+~")]
     flags = [argument for argument in arguments if argument not in given]
-    overrides = complete_overrides(given)
+    overrides = complete_overrides(given, is_sweep=bool({"-m", "--multirun"} & {*flags}))
     parsed = OverridesParser.create().parse_overrides(overrides)
     plain = [o for o in parsed if not o.is_sweep_override() and not o.key_or_group.startswith("hydra")]
     # Reports errors in one line, where Hydra takes several. A swept setting may enable others.
@@ -155,7 +156,7 @@ def _sweep_job(node: DictConfig) -> None:
     """
     runtime = HydraConfig.get().runtime  # with hydra.job.chdir=true this job has another working directory
     with open_dict(node):
-        node.run_dir = os.path.join(runtime.cwd, node.run_dir or runtime.output_dir)
+        node.run_dir = os.path.join(runtime.cwd, user_path(node.run_dir or runtime.output_dir))
     config = with_absolute_paths(to_config(node), Path(runtime.cwd))
     if not config.resume:
         refuse_ineffective(config, (o.partition("=")[0] for o in HydraConfig.get().overrides.task))

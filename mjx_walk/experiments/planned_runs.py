@@ -18,12 +18,13 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import Config, complete_overrides, load_config, read_config
+from mjx_walk.runs.config import Config, load_config, read_config
 from mjx_walk.runs.metrics import read_rows
+from mjx_walk.runs.overrides import complete_overrides, sweep_choices
 from mjx_walk.runs.run_folder import RunFolder, differences
 from mjx_walk.utils.devices import only_device
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import open_to_append
+from mjx_walk.utils.files import open_to_append, user_path
 from mjx_walk.utils.signals import Interrupt
 from mjx_walk.utils.subprocesses import start_module
 from mjx_walk.utils.text import format_score
@@ -97,12 +98,14 @@ def plan(
     """
     choices = [[f"algo={algo}" for algo in algos], *_choices(overrides, hardware)]
     first = load_config([options[0] for options in choices])
-    folder = Path(out or f"runs/compare_{first.env.name}")
+    folder = user_path(out or f"runs/compare_{first.env.name}")
+    if "${" in str(folder):
+        raise UserError(f"out={folder}: '${{' names another setting; choose a name without it")
     runs: dict[str, PlannedRun] = {}
     for seed, chosen in itertools.product(seeds, itertools.product(*choices)):
         swept = [text for text, options in zip(chosen[1:], choices[1:], strict=True) if len(options) > 1]
-        # The folder is an override of a child process, where Hydra would parse "=" and ",".
-        parts = (text.removeprefix("algo").lstrip("=.").replace("=", "-") for text in (chosen[0], *swept))
+        texts = (text.removeprefix("algo").lstrip("=.").replace("'", "") for text in (chosen[0], *swept))
+        parts = (text.replace("=", "-") for text in texts)
         variant = "_".join(re.sub(r"[^\w.+-]+", "_", part) for part in parts)
         run_dir = folder / variant / f"seed_{seed}"
         config = dataclasses.replace(load_config(list(chosen)), seed=seed, run_dir=str(run_dir))
@@ -121,14 +124,15 @@ def _choices(overrides: list[str], hardware: str) -> list[list[str]]:
     """The alternatives of each override: several for one with commas, else one."""
     reserved = {"algo": "algos=[…]", "seed": "seeds=N", "run_dir": "out=DIR", "resume": "nothing: it always resumes"}
     choices = []
-    for override in OverridesParser.create().parse_overrides(complete_overrides([f"hardware={hardware}", *overrides])):
+    completed = complete_overrides([f"hardware={hardware}", *overrides], is_sweep=True)
+    for override in OverridesParser.create().parse_overrides(completed):
         key, text = override.key_or_group, str(override.input_line)
         if key in reserved:
             raise UserError(f"'{text}': in a comparison write {reserved[key]}")
         if override.is_sweep_override() and not override.is_choice_sweep():
             raise UserError(f"'{text}': list the values, {key}=A,B")
         is_swept = override.is_sweep_override()
-        choices.append([f"{key}={value}" for value in override.sweep_string_iterator()] if is_swept else [text])
+        choices.append(sweep_choices(override) if is_swept else [text])
     return choices
 
 
@@ -187,8 +191,7 @@ def start_job(job: list[PlannedRun], log: Path, device: int | None, share: int, 
     env = only_device(device) if device is not None else {}
     if share > 1 and "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:
         env["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{_MEMORY_FRACTION / share:.2f}"
-    quoted = str(first.folder.path.parent).replace("\\", "\\\\").replace("'", "\\'")
-    arguments = [*first.overrides, f"run_dir='{quoted}'", f"seeds={[run.config.seed for run in job]}"]
+    arguments = [*first.overrides, f"run_dir={first.folder.path.parent}", f"seeds={[run.config.seed for run in job]}"]
     if is_resumed:
         arguments.append("resume=true")
     log.parent.mkdir(parents=True, exist_ok=True)

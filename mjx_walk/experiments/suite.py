@@ -16,7 +16,7 @@ from mjx_walk.experiments.report import LEGEND, csv_row, draw_curves, run_cells,
 from mjx_walk.runs.metrics import write_csv
 from mjx_walk.runs.scores import BEST, FINAL
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import replacing, write_text
+from mjx_walk.utils.files import replacing, user_path, write_text
 from mjx_walk.utils.text import format_score
 
 SUITES = {"mujoco": tuple(BUILT_IN_TASKS)}
@@ -54,7 +54,7 @@ def plan_suite(
     for override in overrides:
         if override.partition("=")[0] in ("env", "env.name"):
             raise UserError(f"'{override}': suite={suite} has its own environments; leave one of both out")
-    folder = Path(out or f"runs/compare_{suite}")
+    folder = user_path(out or f"runs/compare_{suite}")
     runs = []
     for env in SUITES[suite]:
         _, planned = planned_runs.plan([f"env={env}", *overrides], algos, seeds, str(folder / env), hardware)

@@ -19,7 +19,12 @@ from mjx_walk.utils.errors import UserError
 __all__ = ["HostArrays", "read_arrays", "write_arrays"]
 
 _NUMPY = "arrays.npz"
-"""File that replaces Orbax's files for small pytrees and in processes other than the main one."""
+"""File that replaces Orbax's files for small pytrees, in processes other than the main one, and below folders in which
+Orbax does not find its files."""
+_SEPARATOR = "\\"
+"""TensorStore takes it for a separator of folders on every system."""
+_NOT_FOR_ORBAX = frozenset("*?[" + _SEPARATOR)
+"""Characters of a path with which Orbax does not find its own files. It takes the first three for a pattern."""
 
 HostArrays = dict[str, np.ndarray]
 """Host copies of a pytree's leaves, by path."""
@@ -33,13 +38,15 @@ def write_arrays(path: Path, arrays: HostArrays, as_numpy: bool = False) -> None
         arrays: arrays of any dtype, by name.
         as_numpy: write one compressed NumPy file instead of Orbax's files.
     """
-    if as_numpy or jax.process_index():  # Orbax writes host arrays only from the main process
+    path = path.resolve()
+    # Orbax writes host arrays only from the main process.
+    if as_numpy or jax.process_index() or _NOT_FOR_ORBAX & {*str(path)}:
         path.mkdir()
         write = np.savez_compressed if as_numpy else np.savez
         write(path / _NUMPY, allow_pickle=False, **arrays)
         return
     with _checkpointer() as checkpointer:
-        checkpointer.save(path.absolute(), arrays)
+        checkpointer.save(path, arrays)
 
 
 def read_arrays(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:
@@ -87,7 +94,11 @@ def _read_numpy(path: Path, expected: Mapping[str, Any], present_name: Callable[
 
 def _read_orbax(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:
     """Read Orbax's files with TensorStore, which shows the metadata of an array before it reads the array."""
-    base = {"driver": "ocdbt", "base": f"file://{path.absolute()}/"}
+    full = str(path.resolve())  # TensorStore refuses `..`
+    if _SEPARATOR in full:
+        raise UserError(f"{full} has a backslash, which TensorStore takes for a separator; rename the folder")
+    # A URL would read some characters of a path as its own syntax.
+    base = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{full}/"}}
     context = tensorstore.Context()
     keys = tensorstore.KvStore.open(base, context=context).result().list().result()
     stored = [key.decode().removesuffix("/.zarray") for key in keys if key.endswith(b"/.zarray")]

@@ -2,17 +2,13 @@
 
 import dataclasses
 import difflib
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-import jax
 import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -22,19 +18,19 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import ENGINES
-from mjx_walk.runs.own_tasks import KEY, find_saved_task, name_task
-from mjx_walk.runs.recipes import CONFIG_DIR, base_recipe, fitting_recipes, recipe_names
+from mjx_walk.runs.overrides import complete_overrides
+from mjx_walk.runs.own_tasks import find_saved_task
+from mjx_walk.runs.recipes import CONFIG_DIR, fitting_recipes, recipe_names
 from mjx_walk.runs.renamed import present_overrides, under_present_names
 from mjx_walk.runs.saved_yaml import read_yaml
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import write_text
+from mjx_walk.utils.files import user_path, write_text
 from mjx_walk.utils.settings import has_effect, refuse_ineffective, setting, validate
 
 __all__ = [
     "CONFIG_DIR",
     "CheckpointConfig",
     "Config",
-    "complete_overrides",
     "compose_config",
     "flatten",
     "load_config",
@@ -155,70 +151,21 @@ def to_config(node: Any) -> Config:
 def with_absolute_paths(config: Config, folder: Path) -> Config:
     """A configuration whose files stay the same ones when the run is resumed from another working directory.
 
+    `run_dir` may stay relative, because a resume names it.
+
     Args:
         config: as a user gives it.
         folder: what a relative path is relative to.
-    """
-    return dataclasses.replace(config, env=envs.with_absolute_paths(config.env, folder))
-
-
-def complete_overrides(overrides: list[str]) -> list[str]:
-    """Translate former names, add what follows from others, and refuse override forms that bypass the schema.
-
-    Without `hardware=` the size of the recipe follows from the devices that JAX sees. `env.task=` runs the file that it
-    names, and gives `env=`. A task or an algorithm of a user without `recipe=` gets that of `base_recipe`.
 
     Raises:
-        UserError: `+key`, `++key` or `~key`, a malformed override, or an unknown environment or algorithm.
+        UserError: a path has `${`, which a saved configuration cannot hold.
     """
-    overrides = _with_named_task(present_overrides(overrides))
-    try:
-        parsed = OverridesParser.create().parse_overrides(overrides)
-    except HydraException as error:
-        raise UserError(f"cannot read the command line: {_first_line(error)}") from error
-    for override in parsed:
-        key = override.key_or_group
-        if key.startswith("hydra"):
-            continue
-        if override.is_add() or override.is_force_add() or override.is_delete():
-            raise UserError(f"'{override.input_line}': keys cannot be added or removed; write {key}=VALUE")
-        known: Collection[str] | None = {"env": TASKS.keys(), "algo": ALGORITHMS.keys()}.get(key)
-        if known and not override.is_sweep_override() and override.value() not in known:
-            raise UserError(f"unknown {key} '{override.value()}'; choose one of: {', '.join(known)}")
-    overrides = [_as_text(override) for override in parsed]
-    if not any(override.key_or_group == "hardware" for override in parsed):
-        overrides = [f"hardware={'cpu' if jax.default_backend() == 'cpu' else 'gpu'}", *overrides]
-    return _with_recipe(overrides)
-
-
-def _with_named_task(overrides: list[str]) -> list[str]:
-    """Overrides with `env=` for the task that `env.task=` names, whose file runs here."""
-    sources = [override.partition("=")[2] for override in overrides if override.partition("=")[0] == KEY]
-    if not sources:
-        return overrides
-    name, source = name_task(sources[-1])
-    rest = [override for override in overrides if override.partition("=")[0] != KEY and override != f"env={name}"]
-    for override in rest:
-        if override.partition("=")[0] == "env":
-            raise UserError(f"give {override} or {KEY}={source}, not both")
-    return [f"env={name}", *rest, f"{KEY}={source}"]
-
-
-def _with_recipe(overrides: list[str]) -> list[str]:
-    """Overrides with the recipe for a task or an algorithm of a user, unless one is given."""
-    given = {"env": "humanoid", "algo": "ppo"} | dict(override.split("=", 1) for override in overrides)
-    if "recipe" in given or given["env"] not in TASKS or given["algo"] not in ALGORITHMS:  # a sweep has several
-        return overrides
-    recipe = base_recipe(given["env"], given["algo"], given["hardware"])
-    return [*overrides, f"recipe={recipe}"] if recipe else overrides
-
-
-def _as_text(override: Override) -> str:
-    """The override's text, quoted where Hydra reads a folder name such as 2026_11_23 as a number."""
-    key, line = override.key_or_group, str(override.input_line)
-    if key in ("run_dir", "wandb_project") and isinstance(override.value(), (bool, int, float)):
-        return f"{key}='{line.partition('=')[2]}'"
-    return line
+    run_dir = str(user_path(config.run_dir)) if config.run_dir is not None else None
+    config = dataclasses.replace(config, run_dir=run_dir, env=envs.with_absolute_paths(config.env, folder))
+    for key, value in flatten(config).items():
+        if isinstance(value, str) and "${" in value:
+            raise UserError(f"{key}={value}: '${{' names another setting; choose a name without it")
+    return config
 
 
 def flatten(config: Config) -> dict[str, Any]:

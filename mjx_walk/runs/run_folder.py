@@ -9,6 +9,7 @@ from mjx_walk.runs.checkpoint import list_steps
 from mjx_walk.runs.config import Config, flatten, read_config, save_config
 from mjx_walk.runs.scores import BEST, FINAL
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import user_path
 
 __all__ = ["MAY_DIFFER", "RunFolder", "differences", "new_path", "open_existing", "prepare"]
 
@@ -64,7 +65,7 @@ def open_existing(path: str | Path | None) -> RunFolder:
     """
     if path is None:
         raise UserError("say which run: run=RUN_DIR")
-    folder = RunFolder(Path(path))
+    folder = RunFolder(user_path(path))
     if not folder.config.is_file():
         raise UserError(f"no run at '{path}': give the folder that holds its config.yaml")
     _refuse_special_files(folder.path)

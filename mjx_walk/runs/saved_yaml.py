@@ -7,6 +7,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import has_controls
 
 __all__ = ["read_yaml"]
 
@@ -39,7 +40,7 @@ def read_yaml(path: Path) -> DictConfig:
                     "write the value itself"
                 )
         # Escape sequences in a message could make a terminal show another command than the one to type.
-        if isinstance(token, yaml.ScalarToken) and not token.value.isprintable():
+        if isinstance(token, yaml.ScalarToken) and has_controls(token.value):
             raise UserError(f"line {token.start_mark.line + 1} of {path} has characters that cannot be printed")
     saved: Any = OmegaConf.create(text)
     if not isinstance(saved, DictConfig):

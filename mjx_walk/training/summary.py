@@ -1,5 +1,6 @@
 """The last lines of a training: which policies were scored, the time it took, its folder, and the next command."""
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -40,7 +41,7 @@ def end_lines(folders: list[Path], training_seconds: float, total_seconds: float
     next_step = (
         "To watch the best policy: python -m mjx_walk.play" if is_scored else "To score: python -m mjx_walk.eval"
     )
-    return [f"Finished in {time}. The results are in {where}", f"{next_step} run={folders[0]}"]
+    return [f"Finished in {time}. The results are in {where}", f"{next_step} {shlex.quote(f'run={folders[0]}')}"]
 
 
 def duration(seconds: float) -> str:

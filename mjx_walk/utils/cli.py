@@ -48,18 +48,20 @@ def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Argument
         raise SystemExit(0)
     known = [field.name for field in dataclasses.fields(schema)]  # type: ignore[arg-type]
     node, hints = OmegaConf.structured(schema), typing.get_type_hints(schema)
+    texts: dict[str, str] = {}
     for argument in arguments:
         key, equals, value = argument.partition("=")
         if not equals or key not in known:
             problem = f"unknown key '{key}'" if equals else f"cannot read '{argument}', write key=value"
             raise UserError(f"{problem}; valid: {', '.join(known)}")
+        if hints[key] in (str, str | None):  # a folder may be called 007 or ${x}
+            texts[key] = value
+            continue
         try:
-            is_text = hints[key] in (str, str | None)  # a folder may be called 007
-            read = value if is_text else OmegaConf.from_dotlist([f"value={value}"]).value
-            OmegaConf.update(node, key, read)
+            OmegaConf.update(node, key, OmegaConf.from_dotlist([f"value={value}"]).value)
         except (OmegaConfBaseException, yaml.YAMLError) as error:
             raise UserError(f"{argument}: {str(error).splitlines()[0]}") from error
-    parsed: Any = OmegaConf.to_object(node)
+    parsed: Any = dataclasses.replace(OmegaConf.to_object(node), **texts)  # type: ignore[type-var]
     validate(parsed)
     return parsed
 

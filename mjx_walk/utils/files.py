@@ -3,12 +3,42 @@
 import contextlib
 import os
 import secrets
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["check_replaceable", "fresh_name", "open_to_append", "replacing", "write_text"]
+__all__ = ["check_replaceable", "fresh_name", "has_controls", "open_to_append", "replacing", "user_path", "write_text"]
+
+_CONTROLS = ("Cc", "Cs", "Zl", "Zp")
+"""Unicode's categories of control characters, lone surrogates, and separators of lines and paragraphs."""
+_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
+"""Unicode's directions of characters that reorder the text around them."""
+
+
+def user_path(path: str | Path) -> Path:
+    """A path that a user gives, with a leading `~` expanded. Expanding the result again changes nothing.
+
+    Raises:
+        UserError: there is no such home folder, or the path is empty or has a character that controls a terminal.
+    """
+    text = str(path)
+    if has_controls(text):
+        raise UserError(f"the path {text!a} has characters that cannot be printed; choose another one")
+    if not text:
+        raise UserError("a path is empty; write the name of a file or folder")
+    if not text.startswith("~"):
+        return Path.cwd() / text if str(Path(text)).startswith("~") else Path(text)
+    try:
+        return Path(text).expanduser()
+    except RuntimeError as error:
+        raise UserError(f"'{text}': there is no such home folder; for a folder of this name write ./{text}") from error
+
+
+def has_controls(text: str) -> bool:
+    """Whether a text has characters that control a terminal, reorder other characters, or are not Unicode."""
+    return any(unicodedata.category(c) in _CONTROLS or unicodedata.bidirectional(c) in _DIRECTIONS for c in text)
 
 
 @contextlib.contextmanager

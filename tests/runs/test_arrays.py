@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -239,3 +240,36 @@ def test_unknown_facts_are_ignored_and_facts_that_are_too_large_are_refused(tmp_
     (path / "meta.json").write_text(" " * 10_000_001)
     with pytest.raises(ValueError, match="larger than 10,000,000 bytes"):
         checkpoint.restore(path, {"a": EXPECTED["a"]})
+
+
+@pytest.mark.parametrize("name", ["é 50%41 #a ]b{x} 'q' \"d\" (1):;&|", "?", "[x]", "*", "back\\slash"])
+def test_a_folder_may_have_any_name(name, tmp_path):
+    arrays = {key: EXPECTED[key] for key in ("a", "flag")}
+    write_arrays(tmp_path / name, arrays)
+    found = read_arrays(tmp_path / name, arrays, same)
+    for key, array in arrays.items():
+        np.testing.assert_array_equal(found[key], array)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", ["?", "[x]", "*", "50%41 #a"])
+def test_arrays_that_are_moved_to_a_folder_of_any_name_can_be_read(name, tmp_path):
+    write_arrays(tmp_path / "fine", {"a": EXPECTED["a"]})
+    (tmp_path / "fine").rename(tmp_path / name)
+    np.testing.assert_array_equal(read_arrays(tmp_path / name, EXPECTED, same)["a"], EXPECTED["a"])
+
+
+def test_a_path_may_lead_through_parents_and_links(tmp_path, monkeypatch):
+    (tmp_path / "back\\slash").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "back\\slash")
+    monkeypatch.chdir(tmp_path / "link")
+    for path in (Path("../back"), Path("a"), tmp_path / "link" / ".." / "b"):
+        write_arrays(path, {"a": EXPECTED["a"]})
+        np.testing.assert_array_equal(read_arrays(path, EXPECTED, same)["a"], EXPECTED["a"])
+
+
+def test_a_run_that_is_moved_to_where_orbax_cannot_read_it_says_so(tmp_path):
+    write_arrays(tmp_path / "fine", {"a": EXPECTED["a"]})
+    (tmp_path / "fine").rename(tmp_path / "back\\slash")
+    with pytest.raises(UserError, match="has a backslash, which TensorStore takes for a separator; rename the folder"):
+        read_arrays(tmp_path / "back\\slash", EXPECTED, same)

@@ -1,5 +1,6 @@
 """What commands print, and where."""
 
+import dataclasses
 import logging
 import sys
 import warnings
@@ -42,3 +43,13 @@ def test_a_training_command_shows_messages_and_progress(tmp_path, capfd):
     assert command_here("train", *TINY, f"run_dir={tmp_path}/run", f"total_steps={TINY_CALL}") == 0
     printed = capfd.readouterr()
     assert "Training walker2d with ppo on the CPU" in printed.out and "64 steps" in printed.err
+
+
+def test_text_is_taken_as_it_is():
+    @dataclasses.dataclass
+    class Arguments:
+        run: str | None = None
+        episodes: int = 1
+
+    for text in ("007", "${x}", "jos\u00e9 (1)=2", "null", "[a]", "'q'"):
+        assert cli.parse(Arguments, [f"run={text}", "episodes=2"], "").run == text
