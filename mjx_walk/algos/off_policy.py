@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import optax
 from brax.training.acme import running_statistics
 from brax.training.acme.running_statistics import RunningStatisticsState
-from brax.training.networks import ACTIVATION
 
 from mjx_walk.algos.base import Algorithm, TrainState
 from mjx_walk.common import networks, returns, rollout
@@ -76,7 +75,7 @@ class OffPolicyConfig:
     critic_hidden_layer_sizes: tuple[int, ...] = setting((256, 256), at_least=1)
     policy_layer_norm: bool = False
     critic_layer_norm: bool = False
-    activation: str = setting("relu", choices=tuple(ACTIVATION))
+    activation: str = setting("relu", choices=networks.ACTIVATIONS)
     network_dtype: str = setting("float32", choices=("float32", "bfloat16"))
     """Dtype in which networks compute. Parameters, losses and optimizers are float32."""
     init_at_random_episode_step: bool = True

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import optax
 from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.agents.ppo import networks as brax_ppo_networks
-from brax.training.networks import ACTIVATION
 
 from mjx_walk.algos.base import Algorithm, TrainState
 from mjx_walk.common import networks, returns, rollout
@@ -65,7 +64,7 @@ class OnPolicyConfig:
     """Bound of normalised observations."""
     policy_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 128), at_least=1)
     value_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 256, 256), at_least=1)
-    activation: str = setting("swish", choices=tuple(ACTIVATION))
+    activation: str = setting("swish", choices=networks.ACTIVATIONS)
     network_dtype: str = setting("float32", choices=("float32", "bfloat16"))
     """Dtype in which networks compute. Parameters, losses and optimizers are float32."""
     distribution: str = setting("tanh_normal", choices=("tanh_normal", "normal"))

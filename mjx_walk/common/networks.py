@@ -17,6 +17,9 @@ from brax.training.networks import ACTIVATION
 from mjx_walk.envs import Task
 from mjx_walk.utils.errors import UserError
 
+ACTIVATIONS = tuple(name for name in ACTIVATION if name not in ("compact", "glu", "logsumexp", "one_hot"))
+"""Names of activations. Brax's own list also has functions that change an array's shape or need more arguments."""
+
 MIN_OBSERVATION_STD = 1e-4
 """Lower bound of an observation's std, so that near-constant ones such as a body's mass are not amplified."""
 

@@ -3,16 +3,13 @@
 Invalid input prints a one-line error and exits with code 2.
 """
 
-import contextlib
 import dataclasses
 import difflib
 import errno
-import logging
 import sys
 import tempfile
 import typing
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -22,6 +19,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mjx_walk.utils.compat import exempt_imports_from_gc, prepare_jax, standard_settings
+from mjx_walk.utils.console import console
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import check_replaceable
 from mjx_walk.utils.settings import validate
@@ -140,47 +138,7 @@ def stay_on_cpu() -> None:
     jax.config.update("jax_platforms", "cpu")
 
 
-_usual_format = warnings.formatwarning
-
-
-def _in_one_line(
-    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
-) -> str:
-    """Format a warning for users as one line, without its source code."""
-    if category is UserWarning:
-        return f"warning: {message}\n"
-    return _usual_format(message, category, filename, lineno, line)
-
-
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
-
-
-class _Console(logging.Handler):
-    """Print log messages without a prefix: information to stdout, warnings and progress to stderr."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        is_warning = record.levelno >= logging.WARNING
-        text = f"{record.levelname.lower()}: {record.getMessage()}" if is_warning else record.getMessage()
-        is_progress = record.name == "mjx_walk.progress"
-        print(text, file=sys.stderr if is_warning or is_progress else sys.stdout, flush=True)
-
-
-@contextlib.contextmanager
-def _console() -> Iterator[None]:
-    """Show this package's log messages and format warnings in one line."""
-    logger, handler = logging.getLogger("mjx_walk"), _Console()
-    level, propagate, format_warning = logger.level, logger.propagate, warnings.formatwarning
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
-    logger.propagate = False  # other libraries may have added handlers to the root logger
-    warnings.formatwarning = _in_one_line
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
-        logger.propagate = propagate
-        warnings.formatwarning = format_warning
 
 
 def main(command: Callable[[list[str]], int | None]) -> NoReturn:
@@ -188,7 +146,7 @@ def main(command: Callable[[list[str]], int | None]) -> NoReturn:
 
     Invalid input, a full or read-only disk, and Ctrl-C print one line instead of a traceback.
     """
-    with _console(), standard_settings():
+    with console(), standard_settings():
         exempt_imports_from_gc()
         prepare_jax()
         sys.exit(_exit_code_of(command))
@@ -196,7 +154,10 @@ def main(command: Callable[[list[str]], int | None]) -> NoReturn:
 
 def _exit_code_of(command: Callable[[list[str]], int | None]) -> int:
     try:
-        return command(sys.argv[1:]) or 0
+        try:
+            return command(sys.argv[1:]) or 0
+        finally:
+            sys.stdout.flush()  # here, where a full disk is reported
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.training.networks import ACTIVATION
 
 from mjx_walk.algos.a2c import A2CConfig
 from mjx_walk.algos.ppo import PPOConfig
@@ -91,3 +92,18 @@ def test_observations_are_clipped_on_policy():
         act, value, policy_params, critic_params = actor_and_critic(PPOConfig(observation_clip=clip))
         assert bool((act(policy_params, far) == act(policy_params, bound)).all()) is is_same
         assert bool((value(critic_params, far, None) == value(critic_params, bound, None)).all()) is is_same
+
+
+def keeps_shapes(activation):
+    """Whether a function maps an array to one of its shape, and has a gradient."""
+    inputs = jax.ShapeDtypeStruct((2, 4), jnp.float32)
+    try:
+        grad = jax.eval_shape(jax.grad(lambda x: activation(x).sum()), inputs)
+        return jax.eval_shape(activation, inputs).shape == grad.shape == (2, 4)
+    except (TypeError, AttributeError, IndexError):
+        return False
+
+
+def test_the_activations_are_those_functions_that_keep_shapes():
+    assert {name for name, function in ACTIVATION.items() if keeps_shapes(function)} == {*networks.ACTIVATIONS}
+    assert {"relu", "swish", "tanh"} < {*networks.ACTIVATIONS} < ACTIVATION.keys()

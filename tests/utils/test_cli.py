@@ -2,11 +2,13 @@
 
 import dataclasses
 import logging
+import os
+import subprocess
 import sys
 import warnings
 
 import pytest
-from helpers import TINY, TINY_CALL, command_here
+from helpers import ENVIRONMENT, TINY, TINY_CALL, command_here
 
 import mjx_walk
 from mjx_walk.utils import cli
@@ -53,3 +55,44 @@ def test_text_is_taken_as_it_is():
 
     for text in ("007", "${x}", "jos\u00e9 (1)=2", "null", "[a]", "'q'"):
         assert cli.parse(Arguments, [f"run={text}", "episodes=2"], "").run == text
+
+
+def test_a_command_finishes_its_work_when_the_reader_of_its_output_ends(monkeypatch, tmp_path):
+    """`train … | head -1`: what it prints has no reader from then on."""
+    reader, writer = os.pipe()
+    monkeypatch.setattr(sys, "argv", ["command"])
+    monkeypatch.setattr(sys, "stdout", os.fdopen(writer, "w"))
+
+    def work(_):
+        logging.getLogger("mjx_walk.training").info("first")
+        os.close(reader)
+        logging.getLogger("mjx_walk.training").info("second")
+        print("third")
+        (tmp_path / "result").touch()
+        print("fourth", flush=True)
+
+    with pytest.raises(SystemExit) as ended:
+        cli.main(work)
+    assert ended.value.code == 0 and (tmp_path / "result").exists()
+    sys.stdout.close()
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device of Linux")
+def test_output_on_a_full_disk_is_reported_in_one_line():
+    code = "import sys; from mjx_walk.utils import cli; cli.main(lambda _: print('text') or sys.exit(int(sys.argv[1])))"
+    for status in ("0", "1"):
+        with open("/dev/full", "w") as full:
+            process = [sys.executable, "-c", code, status]
+            done = subprocess.run(process, env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE, text=True)
+        assert done.returncode == 2 and done.stderr == "error: [Errno 28] No space left on device\n"
+
+
+def test_a_command_runs_without_output_and_in_any_encoding(monkeypatch, tmp_path):
+    path = tmp_path / "output"
+    for stdout in (None, path.open("w", encoding="ascii")):
+        monkeypatch.setattr(sys, "argv", ["command"])
+        monkeypatch.setattr(sys, "stdout", stdout)
+        with pytest.raises(SystemExit) as ended:
+            cli.main(lambda _: print("2 × 3"))
+        assert ended.value.code == 0
+    assert path.read_text() == "2 \\xd7 3\n"
