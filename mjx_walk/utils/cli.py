@@ -138,13 +138,13 @@ def stay_on_cpu() -> None:
     jax.config.update("jax_platforms", "cpu")
 
 
-_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP)
 
 
 def main(command: Callable[[list[str]], int | None]) -> NoReturn:
     """Run a command on the arguments of this process, and exit with its exit code.
 
-    Invalid input, a full or read-only disk, and Ctrl-C print one line instead of a traceback.
+    Invalid input, a full or read-only disk, a path that is too long, and Ctrl-C print one line instead of a traceback.
     """
     with console(), standard_settings():
         exempt_imports_from_gc()

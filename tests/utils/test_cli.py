@@ -57,6 +57,13 @@ def test_text_is_taken_as_it_is():
         assert cli.parse(Arguments, [f"run={text}", "episodes=2"], "").run == text
 
 
+@pytest.mark.parametrize("command", ["eval", "play", "plots", "export"])
+def test_a_path_that_is_too_long_is_refused_in_one_line(command, capsys):
+    assert command_here(command, f"run={'x' * 300}") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ") and "File name too long" in line
+
+
 def test_a_command_finishes_its_work_when_the_reader_of_its_output_ends(monkeypatch, tmp_path):
     """`train … | head -1`: what it prints has no reader from then on."""
     reader, writer = os.pipe()
