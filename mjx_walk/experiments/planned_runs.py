@@ -21,7 +21,7 @@ from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config, load_config, read_config
 from mjx_walk.runs.metrics import read_rows
 from mjx_walk.runs.overrides import complete_overrides, sweep_choices
-from mjx_walk.runs.run_folder import RunFolder, differences
+from mjx_walk.runs.run_folder import RunFolder, differences, in_short
 from mjx_walk.utils.devices import only_device
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import open_to_append, user_path
@@ -145,7 +145,7 @@ def _check_same_configuration(run: PlannedRun) -> None:
         differing.append("total_steps, which may only grow")
     if differing:
         raise UserError(
-            f"{run.folder.path} holds a run with other settings ({', '.join(differing)}); choose another out=DIR"
+            f"{run.folder.path} holds a run with other settings ({in_short(differing)}); choose another out=DIR"
         )
 
 

@@ -11,13 +11,17 @@ from mjx_walk.runs.scores import BEST, FINAL
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import user_path
 
-__all__ = ["MAY_DIFFER", "RunFolder", "differences", "new_path", "open_existing", "prepare"]
+__all__ = ["MAY_DIFFER", "RunFolder", "differences", "in_short", "new_path", "open_existing", "prepare"]
 
 MAY_DIFFER = (
     *("run_dir", "resume", "total_steps", "algo.schedule_steps"),
     *("wandb_project", "evaluation.films", "profile_calls"),
 )
 """Settings that may change when a run is resumed."""
+_CHOOSE_RECIPE = ("env.name", "algo.name", "hardware")
+"""Settings that choose a recipe, from which many others follow."""
+_MOST_NAMED = 5
+"""Most differences that a message names."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +123,7 @@ def prepare(configs: list[Config]) -> tuple[list[RunFolder], list[Config]]:
         _check(folder, config)
         differing = differences(first, config, besides=("run_dir", "resume", "seed"))
         if differing:
-            raise UserError(f"{folder.path} and {folders[0].path} differ in {'; '.join(differing)}; resume each alone")
+            raise UserError(f"{folder.path} and {folders[0].path} differ in {in_short(differing)}; resume each alone")
     steps = {_newest(folder) for folder in folders}
     if len(steps) > 1:
         raise UserError(f"the seeds are at different steps ({', '.join(sorted(steps))}); resume each alone")
@@ -149,6 +153,20 @@ def differences(saved: Config, config: Config, besides: tuple[str, ...] = MAY_DI
     ]
 
 
+def in_short(differing: list[str]) -> str:
+    """One line that names a few differences, and counts the others.
+
+    If there are many, it names those that choose the recipe: the others mostly follow from them.
+
+    Args:
+        differing: see `differences`.
+    """
+    choosing = [text for text in differing if text.partition(" ")[0] in _CHOOSE_RECIPE]
+    named = differing if len(differing) <= _MOST_NAMED else choosing or differing[:_MOST_NAMED]
+    num_others = len(differing) - len(named)
+    return "; ".join([*named, *([f"and {num_others} more"] if num_others else [])])
+
+
 def _check(folder: RunFolder, config: Config) -> None:
     """Check that a run may start or continue in a folder."""
     if folder.path.exists() and not folder.path.is_dir():
@@ -168,7 +186,10 @@ def _check(folder: RunFolder, config: Config) -> None:
         moved.append("env.task ")
     differing = [text for text in differing if not text.startswith(tuple(moved))]
     if differing:
-        raise UserError(f"resume=true with another configuration than {folder.config}: {'; '.join(differing)}")
+        raise UserError(
+            f"resume=true with another configuration than {folder.config}: {in_short(differing)}; "
+            "with run_dir and resume=true alone it continues with the saved settings"
+        )
     if folder.gymnasium_scores.exists() and not list_steps(folder.checkpoints):
         raise UserError(f"no checkpoint in {folder.checkpoints}, although the run was scored; choose another run_dir")
     if config.total_steps < saved.total_steps:

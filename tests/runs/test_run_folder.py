@@ -10,7 +10,7 @@ from helpers import OLD_RUNS, command_here, train_here
 
 from mjx_walk import api
 from mjx_walk.runs import checkpoint
-from mjx_walk.runs.run_folder import open_existing
+from mjx_walk.runs.run_folder import in_short, open_existing
 from mjx_walk.utils.errors import UserError
 
 
@@ -146,3 +146,12 @@ def test_a_link_put_in_place_of_a_half_written_checkpoint_is_not_followed(tmp_pa
     with pytest.raises(FileExistsError):
         checkpoint.save(checkpoints / "best", {"a": 1.0}, {"env_steps": 0})
     assert (precious / "meta.json").read_text() == '"mine"'
+
+
+def test_a_message_names_the_differences_that_matter():
+    few = [f"algo.{name} (was 1, now 2)" for name in "abcde"]
+    assert in_short(few) == "; ".join(few)
+    assert in_short([*few, "num_envs (was 1, now 2)", "seed (was 1, now 2)"]) == "; ".join([*few, "and 2 more"])
+    env = "env.name (was ant, now hopper)"
+    assert in_short([*few, env, "seed (was 1, now 2)"]) == f"{env}; and 6 more"
+    assert in_short([env, few[0]]) == f"{env}; {few[0]}"
