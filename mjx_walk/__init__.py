@@ -7,6 +7,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from mjx_walk.interop.registration import register
+from mjx_walk.utils.opengl import import_mujoco
 from mjx_walk.utils.versions import __version__
 
 __all__ = [
@@ -45,4 +46,5 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'mjx_walk' has no attribute '{name}'")
 
 
+import_mujoco()
 register()

@@ -1,5 +1,6 @@
 """Films and gait sheets, from the real Gymnasium."""
 
+import os
 import subprocess
 import sys
 
@@ -99,14 +100,37 @@ def test_jax_has_not_chosen_a_device_before_the_command_does():
 
 
 def test_opengl_is_chosen_and_what_is_missing_is_said(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "glfw")
-    rendering.choose_opengl()  # the user's stays
-    monkeypatch.delenv("MUJOCO_GL")
-    monkeypatch.setattr(rendering.sys, "platform", "linux")
-    monkeypatch.setattr(rendering, "_PROBE", "import os; assert os.environ['MUJOCO_GL'] == 'osmesa'")
-    rendering.choose_opengl()
-    assert rendering.os.environ["MUJOCO_GL"] == "osmesa"
-    monkeypatch.delenv("MUJOCO_GL")
-    monkeypatch.setattr(rendering, "_PROBE", "raise SystemExit(1)")
-    with pytest.raises(UserError, match="nothing to render with: install EGL or OSMesa"):
+    def choose(given, works):
+        monkeypatch.setenv("MUJOCO_GL", given)
+        monkeypatch.setattr(rendering, "_works", works.__contains__)
         rendering.choose_opengl()
+        return os.environ["MUJOCO_GL"]
+
+    monkeypatch.setattr(rendering.sys, "platform", "linux")
+    assert choose("glfw", ["egl", "glfw"]) == "glfw"  # the user's stays
+    assert choose("", ["egl", "osmesa"]) == "egl"
+    assert choose("", ["osmesa"]) == "osmesa"
+    for given in ("foo", "glfw", "disable", "EGL"):
+        with pytest.raises(UserError, match=f"^MUJOCO_GL={given} does not render here; unset it, or choose "):
+            choose(given, ["egl", "disable", "EGL"])
+    with pytest.raises(UserError, match="nothing to render with: install EGL or OSMesa"):
+        choose("", [])
+
+
+def test_a_renderer_is_tried_in_a_process_of_its_own(monkeypatch):
+    for probe, works in (("import os; assert os.environ['MUJOCO_GL'] == 'x'", True), ("raise SystemExit(1)", False)):
+        monkeypatch.setattr(rendering, "_PROBE", probe)
+        assert rendering._works.__wrapped__("x") is works
+
+
+@pytest.mark.parametrize("value", ["foo", "osmesa", ""])
+def test_only_rendering_needs_a_working_opengl(value, tmp_path):
+    """OSMesa's library is missing on most machines; where it is installed, the film is written."""
+    env = ENVIRONMENT | {"MUJOCO_GL": value}
+    assert command("play", "run=zoo:walker2d-sac", f"html={tmp_path}/page.html", env=env).returncode == 0
+    film = command("play", "run=zoo:walker2d-sac", f"out={tmp_path}/film.mp4", env=env)
+    if film.returncode:
+        assert film.returncode == 2 and len(film.stderr.splitlines()) == 1
+        assert film.stderr.startswith(f"error: MUJOCO_GL={value} does not render" if value else "error: nothing to")
+    else:
+        assert value != "foo"

@@ -1,5 +1,6 @@
 """Rendering without a screen: the choice of OpenGL, and film files."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -13,29 +14,43 @@ import numpy as np
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import replacing
 
-_PROBE = "import mujoco; mujoco.GLContext(64, 64).make_current()"
+_RENDERERS = ("egl", "osmesa", "glfw")
+"""Values of `MUJOCO_GL` that Gymnasium renders with; the last one needs a screen."""
+_PROBE = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 64, 64).render()"
 
 
 def choose_opengl() -> None:
-    """Set `MUJOCO_GL` so that MuJoCo renders without a screen on Linux: EGL if it works, else OSMesa.
+    """Set `MUJOCO_GL` so that Gymnasium renders without a screen on Linux: EGL if it works, else OSMesa.
 
-    A `MUJOCO_GL` that the user has set stays. Other systems need no setting.
+    A `MUJOCO_GL` that the user has set stays, if it works. Other systems need no setting.
 
     Raises:
-        UserError: neither works on this machine.
+        UserError: the user's setting does not work on this machine, or nothing does.
     """
-    if "MUJOCO_GL" in os.environ or sys.platform != "linux":
+    chosen = os.environ.get("MUJOCO_GL")
+    if chosen:
+        if chosen not in _RENDERERS or not _works(chosen):
+            valid = ", ".join(_RENDERERS)
+            raise UserError(f"MUJOCO_GL={chosen} does not render here; unset it, or choose another of: {valid}")
+        return
+    os.environ.pop("MUJOCO_GL", None)  # Gymnasium refuses an empty one
+    if sys.platform != "linux":
         return
     for name in ("egl", "osmesa"):
-        # A broken driver may crash the process, so each probe runs in its own.
-        env = os.environ | {"MUJOCO_GL": name}
-        if not subprocess.run([sys.executable, "-c", _PROBE], env=env, capture_output=True, check=False).returncode:
+        if _works(name):
             os.environ["MUJOCO_GL"] = name
             return
     raise UserError(
         "nothing to render with: install EGL or OSMesa (Debian and Ubuntu: apt-get install libegl1 libopengl0, or "
         "libosmesa6), or set MUJOCO_GL=glfw where there is a screen"
     )
+
+
+@functools.cache
+def _works(name: str) -> bool:
+    """Whether MuJoCo renders with a value of `MUJOCO_GL`. A broken driver may crash, so a child process tries it."""
+    env = os.environ | {"MUJOCO_GL": name}
+    return not subprocess.run([sys.executable, "-c", _PROBE], env=env, capture_output=True, check=False).returncode
 
 
 def write_film(frames: list[np.ndarray], path: Path, frames_per_second: float) -> None:
