@@ -128,7 +128,7 @@ def _through_hydra(arguments: list[str]) -> None:
     Raises:
         UserError: Hydra refuses the arguments.
     """
-    given = [a for a in arguments if not a.startswith("-") and ("=" in a or a[0] in "+~")]
+    given = [a for a in arguments if not a.startswith("-") and ("=" in a or a.startswith(("+", "~")))]
     flags = [argument for argument in arguments if argument not in given]
     overrides = complete_overrides(given, is_sweep=bool({"-m", "--multirun"} & {*flags}))
     parsed = OverridesParser.create().parse_overrides(overrides)

@@ -24,6 +24,9 @@ from mjx_walk.utils.errors import UserError
 
 CASES = [
     (["env=snake"], f"unknown env 'snake'; choose one of: {', '.join(TASKS)}"),
+    (["env=[ant]"], "unknown env '['ant']'; choose one of: humanoid"),
+    (["algo={a:b}"], "unknown algo '{'a': 'b'}'; choose one of: ppo"),
+    (["-m", ""], "mismatched input '<EOF>' expecting"),
     (["seed=1", "seeds=2"], "give seed=N or seeds=[…], not both"),
     (["seeds=[1,1]"], "seeds=[1, 1]: give a number of seeds, or a list of different seeds from 0 up"),
     (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo, sac, csac, td3, ddpg, a2c, reinforce"),

@@ -50,7 +50,7 @@ def complete_overrides(overrides: list[str], is_sweep: bool = False) -> list[str
         if override.is_add() or override.is_force_add() or override.is_delete():
             raise UserError(f"'{override.input_line}': keys cannot be added or removed; write {key}=VALUE")
         known: Collection[str] | None = {"env": TASKS.keys(), "algo": ALGORITHMS.keys()}.get(key)
-        if known and not override.is_sweep_override() and override.value() not in known:
+        if known and not override.is_sweep_override() and str(override.value()) not in known:
             raise UserError(f"unknown {key} '{override.value()}'; choose one of: {', '.join(known)}")
     overrides = [str(override.input_line) for override in parsed]
     if not any(override.key_or_group == "hardware" for override in parsed):
