@@ -16,6 +16,8 @@ _PHYSICS = re.compile(r"_cuda_kernel_forward")
 class DeviceTime(NamedTuple):
     """Seconds on one device. Parts that run at the same time count in full."""
 
+    total: float
+    """From the start of the first operation to the end of the last one."""
     reductions: float
     """Reductions over devices, with the time in which they wait for other devices."""
     physics: float
@@ -35,7 +37,8 @@ def read_device_time(folder: Path) -> DeviceTime:
     if not recordings:
         raise FileNotFoundError(f"no recording of JAX's profiler in {folder}")
     events = list(_operations(ProfileData.from_file(str(recordings[-1]))))
-    return DeviceTime(*(_seconds(events, pattern) for pattern in (_REDUCTION, _PHYSICS)))
+    total = max(event.end_ns for event in events) - min(event.start_ns for event in events)
+    return DeviceTime(total * 1e-9, *(_seconds(events, pattern) for pattern in (_REDUCTION, _PHYSICS)))
 
 
 def _seconds(events: list[ProfileEvent], pattern: re.Pattern) -> float:
