@@ -6,16 +6,21 @@ import warnings
 
 import jax
 
-from mjx_walk.envs import TASKS
+from mjx_walk.envs import TASKS, make_env
 from mjx_walk.evaluation.parity import check
+from mjx_walk.evaluation.random_steps import take_random_steps
 from mjx_walk.utils import cli
 from mjx_walk.utils.settings import setting
 
 USAGE = """
 usage: python -m mjx_walk.parity [physics=warp|jax] [env=all] [version=v5] [num_envs=32] [steps=60] [seed=0]
+                                 [random_steps=10_000_000]
 
 Compares one environment step with the c engine, from standing, airborne, thrown and fallen states. The reference runs
 on the CPU. Exits with 1 if an error exceeds its tolerance.
+
+  random_steps  only take this many steps with random actions, and count those in which a buffer of the physics
+                overflows or a state is not finite; num_envs is then 4096 unless given
 """
 
 
@@ -24,9 +29,10 @@ class Arguments:
     physics: str = setting("warp", choices=("warp", "jax"))
     env: str = setting("all", choices=("all", *TASKS))
     version: str = setting("v5", choices=("v5", "v4"))
-    num_envs: int = setting(32, at_least=3)
+    num_envs: int | None = setting(None, at_least=3)
     steps: int = setting(60, at_least=1)
     seed: int = setting(0, at_least=0)
+    random_steps: int = setting(0, at_least=0)
 
 
 def main(command_line: list[str]) -> int:
@@ -36,7 +42,10 @@ def main(command_line: list[str]) -> int:
     version, physics = arguments.version, arguments.physics
     every = [name for name, (task, _) in TASKS.items() if version in task.XML_FILES]
     for name in every if arguments.env == "all" else (arguments.env,):
-        parity = check(name, version, physics, arguments.num_envs, arguments.steps, arguments.seed)
+        if arguments.random_steps:
+            is_within &= _random_steps(name, arguments)
+            continue
+        parity = check(name, version, physics, arguments.num_envs or 32, arguments.steps, arguments.seed)
         print(f"{name} {version}, {physics} on {jax.devices()[0].device_kind}: {parity.num_steps} steps")
         print(*parity.errors, sep="\n")
         print(
@@ -47,6 +56,16 @@ def main(command_line: list[str]) -> int:
         is_within &= parity.is_within
     print("within tolerance" if is_within else "EXCEEDS its tolerance", file=sys.stderr)
     return 0 if is_within else 1
+
+
+def _random_steps(name: str, arguments: Arguments) -> bool:
+    """Print the counts of one task. Returns whether no step overflowed or broke."""
+    task = make_env(name, physics=arguments.physics, version=arguments.version)
+    taken = take_random_steps(task, arguments.num_envs or 4096, arguments.random_steps, arguments.seed)
+    where = f"{name} {arguments.version}, {arguments.physics} on {jax.devices()[0].device_kind}"
+    counts = f"{taken.num_steps:,} steps, {taken.overflows} overflows, {taken.nonfinite} not finite"
+    print(f"{where}: {counts}", flush=True)
+    return not (taken.overflows or taken.nonfinite)
 
 
 def _with_present_name(argument: str) -> str:

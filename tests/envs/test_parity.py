@@ -10,6 +10,7 @@ from mjx_walk import parity as parity_command
 from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.physics import PhysicsState, make_engine, mjx_warp
 from mjx_walk.evaluation import parity
+from mjx_walk.evaluation.random_steps import take_random_steps
 from mjx_walk.utils.compat import prepare_jax
 from mjx_walk.utils.errors import UserError
 
@@ -140,3 +141,18 @@ def test_warp_overflow_is_reported(monkeypatch):
             for name, size in buffers.items():
                 patched.setattr(mjx_warp, name, size)
             assert overflows() == 2, buffers
+
+
+def test_overflows_and_broken_steps_are_counted(monkeypatch):
+    task = make_env("inverted_pendulum", physics="c")
+    assert take_random_steps(task, num_envs=2, num_steps=501, seed=0) == (1000, 0, 0)
+    step = task.engine.step
+
+    def breaks(state, ctrl):
+        state, derived, overflow = step(state, ctrl)
+        return state._replace(qpos=jnp.where(ctrl > 0, jnp.nan, state.qpos)), derived, jnp.ones_like(overflow)
+
+    monkeypatch.setattr(task.engine, "step", breaks, raising=False)
+    num_steps, overflows, nonfinite = take_random_steps(task, num_envs=2, num_steps=1, seed=0)
+    assert overflows == num_steps == 500
+    assert 150 < nonfinite < 350  # half of the actions
