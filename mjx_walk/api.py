@@ -18,7 +18,7 @@ from mjx_walk.envs import BUILT_IN_TASKS, Task, register_task
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.envs.registry import task_name
 from mjx_walk.envs.user_files import only_known, source_path
-from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium, score_in_sim
+from mjx_walk.evaluation.gymnasium_scores import Episodes, compile_episodes, score_in_gymnasium, score_in_sim
 from mjx_walk.runs import run_folder
 from mjx_walk.runs.config import Config, load_config, read_config
 from mjx_walk.runs.loggers import require_wandb
@@ -62,12 +62,16 @@ class Run(SavedPolicy):
                 your own has no equal in Gymnasium: both backends score it in the engine.
             seed: seed of the resets.
         """
-        if backend == "gymnasium":
+        if backend == "gymnasium" and self.task.is_in_gymnasium:
             return score_in_gymnasium(self.task, self.act, episodes, seed)
         if self.reward_function:
             _LOGGER.warning("scoring Gymnasium's reward: the run's own, %s, is not loaded", self.reward_function)
+        return score_in_sim(self.task, self._episodes, episodes, seed)
+
+    @functools.cached_property
+    def _episodes(self) -> Episodes:
         policy = self.algorithm.policy(self.policy_params, deterministic=True)
-        return score_in_sim(self.task, policy, episodes, seed)
+        return compile_episodes(self.task, policy)
 
 
 def load_run(path: str | Path, physics: str | None = None, policy: str = BEST, task: type[Task] | None = None) -> Run:

@@ -98,6 +98,19 @@ def test_a_loaded_policy_scores_alike_in_its_engine_and_in_gymnasium(finished):
     assert abs(sim.mean - real.mean) < max(4 * error, 0.02 * abs(real.mean))
 
 
+def test_scores_in_the_engine_compile_once(finished, monkeypatch):
+    run, _ = finished
+    loaded, traces = mjx_walk.load_run(run.path), []
+    step = loaded.task.step
+    monkeypatch.setattr(loaded.task, "step", lambda *args: traces.append(1) or step(*args))
+    first = loaded.evaluate(2, backend="sim")
+    assert traces
+    traces.clear()
+    other, again = loaded.evaluate(2, backend="sim", seed=1), loaded.evaluate(2, backend="sim")
+    assert not traces
+    assert again.returns.tolist() == first.returns.tolist() != other.returns.tolist()
+
+
 def test_many_episodes_are_played_in_rounds(finished, monkeypatch):
     run, _ = finished
     at_once = run.evaluate(5, seed=3)

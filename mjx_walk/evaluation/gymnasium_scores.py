@@ -19,6 +19,8 @@ from mjx_walk.utils.types import PolicyFn
 
 _MAX_PARALLEL_EPISODES = 1024
 """Episodes played at once; an environment takes about 1 MB."""
+Episodes = Callable[[jax.Array, int], tuple[jax.Array, jax.Array]]
+"""`key, N → returns [N] f32, lengths [N] i32`."""
 
 
 def score_in_gymnasium(task: Task, act: Callable[[Any], Any], num_episodes: int, seed: int = 0) -> Scores:
@@ -33,7 +35,7 @@ def score_in_gymnasium(task: Task, act: Callable[[Any], Any], num_episodes: int,
         seed: episode i is reset with `seed + i`.
     """
     if not task.is_in_gymnasium:
-        return score_in_sim(task, lambda obs, key: act(obs), num_episodes, seed)
+        return score_in_sim(task, compile_episodes(task, lambda obs, key: act(obs)), num_episodes, seed)
     seeds = [seed + i for i in range(num_episodes)]
     rounds = [seeds[i : i + _MAX_PARALLEL_EPISODES] for i in range(0, num_episodes, _MAX_PARALLEL_EPISODES)]
     returns, lengths = zip(*(_play_in_gymnasium(task, act, some) for some in rounds), strict=True)
@@ -80,8 +82,20 @@ def _receive(worker: Popen) -> Any:
         raise RuntimeError("a Gymnasium process ended; its error is above") from None
 
 
-def score_in_sim(task: Task, policy: PolicyFn, num_episodes: int, seed: int = 0) -> Scores:
-    """Score complete episodes in the task's own engine, all in one batch."""
-    returns, lengths = jax.jit(lambda key: evaluate(task, num_episodes, policy, key))(jax.random.PRNGKey(seed))
+def compile_episodes(task: Task, policy: PolicyFn) -> Episodes:
+    """Compile complete episodes in the task's own engine, once for each number of episodes."""
+    return jax.jit(lambda key, num_episodes: evaluate(task, num_episodes, policy, key), static_argnums=1)
+
+
+def score_in_sim(task: Task, episodes: Episodes, num_episodes: int, seed: int = 0) -> Scores:
+    """Score complete episodes in the task's own engine, all in one batch.
+
+    Args:
+        task: the environment.
+        episodes: see `compile_episodes`.
+        num_episodes: N.
+        seed: of the starts.
+    """
+    returns, lengths = episodes(jax.random.PRNGKey(seed), num_episodes)
     name = f"{task.gymnasium_id} on {task.engine.name}"
     return Scores(np.asarray(returns, np.float64), np.asarray(lengths, np.int64), [seed], name)
