@@ -260,7 +260,8 @@ class OffPolicyAlgorithm(Algorithm):
         replay = self.buffer.insert(state.replay, steps)
         rate_factor = schedule_factor(config.learning_rate_schedule, remaining)
         settings = functools.partial(Batch, reward_scale=reward_scale, rate_factor=rate_factor, remaining=remaining)
-        train = functools.partial(self._train, settings, replay, normalizer, discount, update_key)
+        learn = functools.partial(self._train, settings, replay, normalizer, discount, update_key)
+        train = jax.jit(learn, inline=True)  # traced once for both branches
         can_learn = replay.rows >= self.rows_before_learning
         learner, metrics = jax.lax.cond(can_learn, train, functools.partial(_wait, train), state.learner)
         new_state = state.replace(
