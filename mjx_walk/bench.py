@@ -1,7 +1,6 @@
 """`python -m mjx_walk.bench env=humanoid`: speeds of training and its parts on this machine, next to Gymnasium's."""
 
 import dataclasses
-import itertools
 import json
 from collections.abc import Iterable
 from typing import Any
@@ -60,12 +59,12 @@ def main(command_line: list[str]) -> None:
     if sizes:
         results = _print(scaling.measure(overrides, config, sizes, arguments.seconds))
     else:
-        first_calls = list(timing.measure_first_calls(overrides))
+        results = _print(timing.measure_first_calls(overrides))
     task = make_task(config)
     device = f"{jax.devices()[0].device_kind}, physics={task.engine.name}, {config.num_envs} environments"
     print(f"{task.gymnasium_id} on {device}", flush=True)
     if not sizes:
-        results = _print(itertools.chain(first_calls, profile.measure(config, task, arguments.seconds)))
+        results |= _print(profile.measure(config, task, arguments.seconds))
     if arguments.peers:
         from mjx_walk.experiments import peers  # Brax's trainers take seconds to import
 

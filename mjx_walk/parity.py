@@ -39,23 +39,26 @@ def main(command_line: list[str]) -> int:
     """Print a table for each task. Returns 1 if an error exceeds its tolerance."""
     arguments = cli.parse(Arguments, [_with_present_name(argument) for argument in command_line], USAGE)
     is_within = True
-    version, physics = arguments.version, arguments.physics
-    every = [name for name, (task, _) in TASKS.items() if version in task.XML_FILES]
+    one = _random_steps if arguments.random_steps else _single_steps
+    every = [name for name, (task, _) in TASKS.items() if arguments.version in task.XML_FILES]
     for name in every if arguments.env == "all" else (arguments.env,):
-        if arguments.random_steps:
-            is_within &= _random_steps(name, arguments)
-            continue
-        parity = check(name, version, physics, arguments.num_envs or 32, arguments.steps, arguments.seed)
-        print(f"{name} {version}, {physics} on {jax.devices()[0].device_kind}: {parity.num_steps} steps")
-        print(*parity.errors, sep="\n")
-        print(
-            f"  {parity.num_terminations} terminations, {parity.termination_mismatches} mismatches; "
-            f"{parity.overflows} overflows, {parity.nonfinite} not finite",
-            flush=True,
-        )
-        is_within &= parity.is_within
+        is_within &= one(name, arguments)
     print("within tolerance" if is_within else "EXCEEDS its tolerance", file=sys.stderr)
     return 0 if is_within else 1
+
+
+def _single_steps(name: str, arguments: Arguments) -> bool:
+    """Print the table of one task. Returns whether every error is within its tolerance."""
+    version, physics = arguments.version, arguments.physics
+    parity = check(name, version, physics, arguments.num_envs or 32, arguments.steps, arguments.seed)
+    print(f"{name} {version}, {physics} on {jax.devices()[0].device_kind}: {parity.num_steps} steps")
+    print(*parity.errors, sep="\n")
+    print(
+        f"  {parity.num_terminations} terminations, {parity.termination_mismatches} mismatches; "
+        f"{parity.overflows} overflows, {parity.nonfinite} not finite",
+        flush=True,
+    )
+    return parity.is_within
 
 
 def _random_steps(name: str, arguments: Arguments) -> bool:

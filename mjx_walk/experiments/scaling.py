@@ -20,8 +20,6 @@ from mjx_walk.training.call_profile import CALLS_BEFORE
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
 
-_UNTIMED_ROWS = 2
-"""The first call compiles the training's programs, and the programs that read its results compile after it."""
 _MIN_CALLS = 3
 _RECORDED_CALLS = 2
 _ENDLESS = 10**12
@@ -51,13 +49,16 @@ def measure(overrides: list[str], config: Config, sizes: list[int], seconds: flo
     shares = {size: share_of_total(config, size) for size in sizes if size > 1}
     alone = None
     for size in sizes:
-        for settings in ([], shares[size]) if size > 1 else ([],):
-            speed = measure_speed([*overrides, *settings], size, seconds)
+        variants: list[tuple[int, list[str]]] = [(config.num_envs, [])]
+        if size > 1:
+            variants.append((config.num_envs // size, shares[size]))
+        for num_envs, settings in variants:
+            arguments = [*overrides, *settings]
+            speed = measure_speed(arguments, size, seconds)
             alone = speed.steps_per_second if size == 1 else alone
-            num_envs = config.num_envs // size if settings else config.num_envs
             name = f"{size} x {num_envs} environments"
             yield from _speeds(name, speed, alone if size > 1 else None)
-            yield from _parts(name, [*overrides, *settings], size)
+            yield from _parts(name, arguments, size)
     if shares:
         # Only now, because this process would allocate the devices' memory.
         algorithm = make_algorithm(
@@ -85,7 +86,7 @@ def share_of_total(config: Config, size: int) -> list[str]:
 def measure_speed(overrides: list[str], size: int, seconds: float) -> Speed:
     """Train on `size` devices, with the overrides' environments on each, until enough calls are logged."""
     with _training(overrides, size, functools.partial(_are_enough, seconds)) as (rows, _):
-        timed = rows[_UNTIMED_ROWS - 1 :]
+        timed = _timed(rows)
     steps, time_taken = (timed[-1][name] - timed[0][name] for name in ("env_steps", "wall_seconds"))
     return Speed(steps / time_taken, time_taken / (len(timed) - 1))
 
@@ -97,9 +98,14 @@ def _training(
     return training([*overrides, f"total_steps={_ENDLESS}", f"devices={size}"], are_enough, signal.SIGTERM)
 
 
+def _timed(rows: list[Row]) -> list[Row]:
+    """The rows from the end of the last call that compiles."""
+    return rows[CALLS_BEFORE - 1 :]
+
+
 def _are_enough(seconds: float, rows: list[Row]) -> bool:
     """Whether the timed rows span enough calls and time."""
-    timed = rows[_UNTIMED_ROWS - 1 :]
+    timed = _timed(rows)
     return len(timed) > _MIN_CALLS and timed[-1]["wall_seconds"] - timed[0]["wall_seconds"] >= seconds
 
 
