@@ -102,7 +102,7 @@ def make_devices_program(algorithm: Algorithm, processes: Processes, iterations_
         1,
         init=lambda keys: init(keys[0]),
         step=_make_step(algorithm, processes, iterations_per_call),
-        split_metrics=lambda metrics: [jax.device_get(metrics)],
+        split_metrics=lambda metrics: [_squeeze(jax.device_get(metrics))],
         max_over_processes=lambda number: max(processes.all_gather(number)),
     )
 
@@ -117,7 +117,10 @@ def _init_on_device(algorithm: Algorithm, process_index: int, key: jax.Array) ->
 
 
 def _make_step(algorithm: Algorithm, processes: Processes, iterations_per_call: int) -> Step:
-    """Like `programs.make_step`, with metrics over all devices."""
+    """Like `programs.make_step`, with metrics over all devices.
+
+    Nothing is allocated in a call after its first iteration, so that the memory of physics does not move.
+    """
     devices = sorted(jax.devices(), key=lambda device: device.process_index)
     sharding = NamedSharding(Mesh(np.array(devices), (DEVICES,)), PartitionSpec(DEVICES))
 
@@ -125,14 +128,51 @@ def _make_step(algorithm: Algorithm, processes: Processes, iterations_per_call: 
     def collect(state):
         return _expand(algorithm.collect(_squeeze(state)))
 
-    def learn(state, batch):
-        state, metrics = algorithm.learn(_squeeze(state), _squeeze(batch))
-        return _expand((state, {name: _over_devices(metric) for name, metric in metrics.items()}))
+    learn = _learn_together(algorithm, sharding)
+
+    @functools.partial(jax.jit, donate_argnums=(0, 2), out_shardings=sharding)
+    def learn_and_log(state, batch, rows, index):
+        state, metrics = learn(state, batch)
+        return state, jax.tree.map(lambda row, x: row.at[:, index].set(x), rows, metrics)
 
     def share(x: jax.Array) -> jax.Array:
         """Array over all devices with this process's part in place. Copies nothing."""
         shape = (processes.process_count, *x.shape[1:])
         return jax.make_array_from_single_device_arrays(shape, sharding, [x])
+
+    collect_in_place = in_place(collect)
+    compiled: list[Callable] = []
+    batches: list[Any] = []
+    row_shapes: list[Metrics] = []
+
+    def step(state: TrainState) -> tuple[TrainState, Metrics]:
+        if not batches:
+            batches.append(jax.tree.map(jnp.zeros_like, jax.eval_shape(collect, state)[1]))
+        rows = None
+        for index in range(iterations_per_call):
+            state, batch = collect_in_place(state, batches.pop())
+            batches.append(batch)
+            shared = jax.tree.map(share, (state, batch))
+            if not row_shapes:
+                row_shapes.append(jax.eval_shape(learn, *shared)[1])
+            if rows is None:
+                rows = jax.tree.map(lambda x: jnp.zeros((1, iterations_per_call), x.dtype), row_shapes[0])
+            arguments = (*shared, jax.tree.map(share, rows), np.int32(index))
+            if not compiled:
+                compiled.append(learn_and_log.lower(*arguments).compile())
+                processes.wait_for_all()
+            state, rows = jax.tree.map(lambda x: x.addressable_data(0), compiled[0](*arguments))
+        return state, rows
+
+    return step
+
+
+def _learn_together(algorithm: Algorithm, sharding: NamedSharding) -> Callable[[Any, Any], tuple[Any, Metrics]]:
+    """`learn` over all devices: `(state, batch) → (state, metrics)`, with an axis of devices in front."""
+
+    def learn(state, batch):
+        state, metrics = algorithm.learn(_squeeze(state), _squeeze(batch))
+        return _expand((state, {name: _over_devices(metric) for name, metric in metrics.items()}))
 
     mapped = jax.shard_map(
         learn,
@@ -141,26 +181,7 @@ def _make_step(algorithm: Algorithm, processes: Processes, iterations_per_call: 
         out_specs=PartitionSpec(DEVICES),
         check_vma=False,  # Brax's networks and losses do not annotate it
     )
-    collect_in_place, learn_together = in_place(collect), jax.jit(mapped, donate_argnums=0)
-    compiled: list[Callable] = []
-    batches: list[Any] = []
-
-    def step(state: TrainState) -> tuple[TrainState, Metrics]:
-        if not batches:
-            batches.append(jax.tree.map(jnp.zeros_like, jax.eval_shape(collect, state)[1]))
-        rows = []
-        for _ in range(iterations_per_call):
-            state, batch = collect_in_place(state, batches.pop())
-            batches.append(batch)
-            shared = jax.tree.map(share, (state, batch))
-            if not compiled:
-                compiled.append(learn_together.lower(*shared).compile())
-                processes.wait_for_all()
-            state, metrics = jax.tree.map(lambda x: x.addressable_data(0), compiled[0](*shared))
-            rows.append(metrics)
-        return state, jax.tree.map(lambda *xs: jnp.concatenate(xs), *rows)
-
-    return step
+    return jax.jit(mapped, inline=True)  # traced once for both the metrics' types and the program
 
 
 def in_place(collect: Callable[[Any], tuple[Any, Any]]) -> Callable[[Any, Any], tuple[Any, Any]]:
