@@ -46,5 +46,9 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'mjx_walk' has no attribute '{name}'")
 
 
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
 import_mujoco()
 register()

@@ -11,6 +11,7 @@ from mjx_walk.api import resolve
 from mjx_walk.experiments import profile, scaling, timing
 from mjx_walk.experiments.timing import Measurement
 from mjx_walk.runs.config import Config
+from mjx_walk.runs.overrides import key_of_value
 from mjx_walk.runs.policies import make_task
 from mjx_walk.training import launcher
 from mjx_walk.utils import cli
@@ -45,7 +46,7 @@ class Arguments:
 
 def main(command_line: list[str]) -> None:
     """Measure, print a table, and write JSON if asked."""
-    arguments, overrides = cli.parse_own(Arguments, Config, command_line, USAGE)
+    arguments, overrides = cli.parse_own(Arguments, Config, command_line, USAGE, key_of_value)
     config = resolve(overrides)
     algo = config.algo.name
     if arguments.peers and algo not in ("ppo", "sac"):

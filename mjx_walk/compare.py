@@ -15,6 +15,7 @@ from mjx_walk.experiments import planned_runs
 from mjx_walk.experiments.planned_runs import PlannedRun
 from mjx_walk.experiments.suite import SUITES, plan_suite, write_report
 from mjx_walk.runs.config import Config
+from mjx_walk.runs.overrides import key_of_value
 from mjx_walk.utils import cli
 from mjx_walk.utils.devices import count_devices
 from mjx_walk.utils.errors import UserError
@@ -57,7 +58,7 @@ class Arguments:
 
 def main(command_line: list[str]) -> int:
     """Train the runs that are not finished, and draw all. Returns the exit code."""
-    arguments, overrides = cli.parse_own(Arguments, Config, command_line, USAGE)
+    arguments, overrides = cli.parse_own(Arguments, Config, command_line, USAGE, key_of_value)
     if arguments.draw:
         if arguments.out is None:
             raise UserError("say which runs to draw: out=DIR")

@@ -26,7 +26,7 @@ from mjx_walk.runs.config import (
     to_config,
     with_absolute_paths,
 )
-from mjx_walk.runs.overrides import complete_overrides
+from mjx_walk.runs.overrides import complete_overrides, key_of_value
 from mjx_walk.runs.renamed import present_overrides
 from mjx_walk.training import launcher
 from mjx_walk.training.distributed import Processes, join_processes
@@ -56,6 +56,9 @@ usage: python -m mjx_walk.train [env=humanoid] [algo=ppo] [KEY=VALUE ...]
   algo=NAME --help                        also list the settings of the algorithm, with ranges and conditions
 """
 
+_HYDRAS_FLAGS_WITH_VALUE = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--experimental-rerun")
+_HYDRAS_OTHER_FLAGS = ("--multirun", "-m", "--resolve", "--hydra-help", "--shell-completion", "-sc")
+
 
 @dataclasses.dataclass
 class Own:
@@ -72,10 +75,11 @@ def main(arguments: list[str]) -> int:
     if any(argument in ("-h", "--help") for argument in arguments):
         print(_help(arguments))
         return 0
+    cli.refuse_flags(_without_hydras(arguments), key_of_value)
     if any(argument.startswith("-") for argument in arguments):
         _through_hydra(arguments)
         return 0
-    own, overrides = cli.parse_own(Own, Config, arguments, USAGE)
+    own, overrides = cli.parse_own(Own, Config, arguments, USAGE, key_of_value)
     overrides = present_overrides(overrides)
     if own.seeds is not None and own.devices is not None:
         raise UserError("give seeds=… or devices=…, not both")
@@ -120,6 +124,17 @@ def _train_in_process(overrides: list[str], processes: Processes) -> int:
         sys.stderr.flush()
         os._exit(1)
     return exit_code(signal_name) if signal_name else 0
+
+
+def _without_hydras(arguments: list[str]) -> list[str]:
+    """The arguments that are not Hydra's flags or their values."""
+    flags = (*_HYDRAS_FLAGS_WITH_VALUE, *_HYDRAS_OTHER_FLAGS)
+    before = ["", *arguments]
+    return [
+        argument
+        for argument, previous in zip(arguments, before, strict=False)
+        if argument.partition("=")[0] not in flags and previous not in _HYDRAS_FLAGS_WITH_VALUE
+    ]
 
 
 def _through_hydra(arguments: list[str]) -> None:

@@ -41,7 +41,14 @@ CASES = [
     (["+extra=1"], "'+extra=1': keys cannot be added or removed"),
     (["++extra=1"], "keys cannot be added or removed"),
     (["~seed"], "keys cannot be added or removed"),
-    (["humanoid"], "cannot read the command line"),
+    (["humanoid"], "cannot read 'humanoid'; write env=humanoid"),
+    (["csac"], "cannot read 'csac'; write algo=csac"),
+    (["env", "humanoid"], "cannot read 'env humanoid'; write env=humanoid"),
+    (["--num_envs", "5"], "cannot read '--num_envs 5'; write num_envs=5"),
+    (["--num-envs=5"], "cannot read '--num-envs=5'; write num_envs=5"),
+    (["--resume", "seed=1"], "cannot read '--resume'; write resume=VALUE"),
+    (["-m", "seed=0,1", "--env", "humanoid"], "cannot read '--env humanoid'; write env=humanoid"),
+    (["runs/x"], "cannot read 'runs/x'; write KEY=VALUE"),
     (["num_envs=many"], "num_envs: Value 'many' of type 'str' could not be converted to Integer"),
     (["num_envs=0"], "num_envs=0: must be at least 1"),
     (["total_steps=-5"], "total_steps=-5: must be at least 1"),
@@ -97,7 +104,9 @@ EVAL_CASES = [
     (["run=x", "physics=jax"], "physics=jax needs backend=sim"),
     (["run=x", "backend=brax"], "choose one of: gymnasium, sim"),
     (["run=x", "epsodes=3"], "unknown key 'epsodes'; valid: run, policy, episodes, backend, seed, physics"),
-    (["x"], "cannot read 'x', write key=value"),
+    (["runs/x"], "cannot read 'runs/x'; write run=runs/x"),
+    (["run", "x"], "cannot read 'run x'; write run=x"),
+    (["--episodes", "5"], "cannot read '--episodes 5'; write episodes=5"),
 ]
 
 

@@ -107,6 +107,8 @@ def test_editable(clone, tmp_path):
         capture_output=True,
     )
     assert python_use(tmp_path, executable=python).is_relative_to(clone)
+    listed = subprocess.run([python.with_name("mjx-walk")], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert listed.stdout.startswith("usage: mjx-walk COMMAND")
 
 
 def printed(code, *paths):

@@ -18,7 +18,7 @@ from mjx_walk.runs.recipes import base_recipe
 from mjx_walk.runs.renamed import present_overrides
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["complete_overrides", "sweep_choices"]
+__all__ = ["complete_overrides", "key_of_value", "sweep_choices"]
 
 _TEXTS = frozenset({"run_dir", "wandb_project"})
 """Settings that hold any text, besides those of tasks and algorithms."""
@@ -56,6 +56,11 @@ def complete_overrides(overrides: list[str], is_sweep: bool = False) -> list[str
     if not any(override.key_or_group == "hardware" for override in parsed):
         overrides = [f"hardware={'cpu' if jax.default_backend() == 'cpu' else 'gpu'}", *overrides]
     return _with_recipe(overrides)
+
+
+def key_of_value(value: str) -> str | None:
+    """The key of an environment's or an algorithm's name that is given alone."""
+    return "env" if value in TASKS else "algo" if value in ALGORITHMS else None
 
 
 def sweep_choices(override: Override) -> list[str]:

@@ -148,14 +148,14 @@ def _make_step(algorithm: Algorithm, processes: Processes, iterations_per_call: 
     def step(state: TrainState) -> tuple[TrainState, Metrics]:
         if not batches:
             batches.append(jax.tree.map(jnp.zeros_like, jax.eval_shape(collect, state)[1]))
-        rows = None
+        rows: Metrics = {}
         for index in range(iterations_per_call):
             state, batch = collect_in_place(state, batches.pop())
             batches.append(batch)
             shared = jax.tree.map(share, (state, batch))
             if not row_shapes:
                 row_shapes.append(jax.eval_shape(learn, *shared)[1])
-            if rows is None:
+            if not rows:
                 rows = jax.tree.map(lambda x: jnp.zeros((1, iterations_per_call), x.dtype), row_shapes[0])
             arguments = (*shared, jax.tree.map(share, rows), np.int32(index))
             if not compiled:

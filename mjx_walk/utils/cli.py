@@ -6,6 +6,8 @@ Invalid input prints a one-line error and exits with code 2.
 import dataclasses
 import difflib
 import errno
+import itertools
+import re
 import sys
 import tempfile
 import typing
@@ -24,10 +26,21 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import check_replaceable
 from mjx_walk.utils.settings import validate
 from mjx_walk.utils.signals import Stopped, exit_code
+from mjx_walk.utils.versions import __version__
 
-__all__ = ["check_suffix", "check_writable", "main", "parse", "parse_own", "read_seeds", "stay_on_cpu"]
+__all__ = [
+    "check_suffix",
+    "check_writable",
+    "main",
+    "parse",
+    "parse_own",
+    "read_seeds",
+    "refuse_flags",
+    "stay_on_cpu",
+]
 
 Arguments = TypeVar("Arguments")
+_HELP = ("-h", "--help")
 
 
 def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Arguments:
@@ -41,17 +54,17 @@ def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Argument
     Raises:
         UserError: an unknown key, a wrong type, or a value out of range.
     """
-    if any(argument in ("-h", "--help") for argument in arguments):
+    if any(argument in _HELP for argument in arguments):
         print(usage.strip())
         raise SystemExit(0)
     known = [field.name for field in dataclasses.fields(schema)]  # type: ignore[arg-type]
+    refuse_flags(arguments, lambda value: "run" if "run" in known and value not in known else None)
     node, hints = OmegaConf.structured(schema), typing.get_type_hints(schema)
     texts: dict[str, str] = {}
     for argument in arguments:
-        key, equals, value = argument.partition("=")
-        if not equals or key not in known:
-            problem = f"unknown key '{key}'" if equals else f"cannot read '{argument}', write key=value"
-            raise UserError(f"{problem}; valid: {', '.join(known)}")
+        key, _, value = argument.partition("=")
+        if key not in known:
+            raise UserError(f"unknown key '{key}'; valid: {', '.join(known)}")
         if hints[key] in (str, str | None):  # a folder may be called 007 or ${x}
             texts[key] = value
             continue
@@ -65,7 +78,11 @@ def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Argument
 
 
 def parse_own(
-    schema: type[Arguments], others: type[Any], arguments: list[str], usage: str
+    schema: type[Arguments],
+    others: type[Any],
+    arguments: list[str],
+    usage: str,
+    key_of: Callable[[str], str | None] = lambda value: None,
 ) -> tuple[Arguments, list[str]]:
     """Read the arguments whose keys are in the schema, and return the others, which are settings of a training run.
 
@@ -74,6 +91,7 @@ def parse_own(
         others: dataclass of a training run's settings.
         arguments: the command line.
         usage: text for `--help`.
+        key_of: as for `refuse_flags`.
 
     Raises:
         UserError: a wrong type, a value out of range, or an unknown key that resembles one of the schema.
@@ -81,15 +99,41 @@ def parse_own(
     own_keys, other_keys = ([field.name for field in dataclasses.fields(kind)] for kind in (schema, others))  # type: ignore[arg-type]
     own: list[str] = []
     rest: list[str] = []
+    refuse_flags([argument for argument in arguments if argument not in _HELP], key_of)
     for argument in arguments:
         key = argument.partition("=")[0]
-        is_own = key in (*own_keys, "-h", "--help")
+        is_own = key in (*own_keys, *_HELP)
         (own if is_own else rest).append(argument)
         near = difflib.get_close_matches(key, own_keys + other_keys)
         is_known = is_own or key.lstrip("+~") in other_keys or "." in key or "/" in key
         if {*own_keys} & {*near} and not is_known:
             raise UserError(f"unknown key '{key}'; did you mean: {', '.join(near)}?")
     return parse(schema, own, usage), rest
+
+
+def refuse_flags(arguments: list[str], key_of: Callable[[str], str | None] = lambda value: None) -> None:
+    """Check that every argument is `key=value`, and say how to write one that is not: `--num_envs 5`, `env humanoid`.
+
+    Args:
+        arguments: a part of the command line.
+        key_of: maps a value that is given alone to the key that is meant, if it can be guessed.
+
+    Raises:
+        UserError: an argument without `=`, or one that begins with a dash.
+    """
+    for argument, following in itertools.zip_longest(arguments, arguments[1:], fillvalue=""):
+        key, equals, value = argument.partition("=")
+        if (equals and not key.startswith("-")) or not argument or argument[0] in "+~":  # Hydra's, refused elsewhere
+            continue
+        name = key.lstrip("-").replace("-", "_")
+        if not argument.startswith("-") and key_of(argument):
+            wanted, given = f"{key_of(argument)}={argument}", argument
+        elif equals or not following or "=" in following or following.startswith("-"):
+            wanted, given = f"{name}={value or 'VALUE'}", argument
+        else:
+            wanted, given = f"{name}={following}", f"{argument} {following}"
+        is_key = re.fullmatch(r"[\w.]+=.*", wanted, re.DOTALL)
+        raise UserError(f"cannot read '{given}'; write {wanted if is_key else 'KEY=VALUE'}")
 
 
 def read_seeds(value: Any) -> list[int]:
@@ -153,6 +197,9 @@ def main(command: Callable[[list[str]], int | None]) -> NoReturn:
 
 
 def _exit_code_of(command: Callable[[list[str]], int | None]) -> int:
+    if "--version" in sys.argv[1:]:
+        print(f"mjx_walk {__version__}")
+        return 0
     try:
         try:
             return command(sys.argv[1:]) or 0

@@ -1,0 +1,60 @@
+"""`mjx-walk COMMAND`, or `python -m mjx_walk COMMAND`: run a command, or list all of them."""
+
+import ast
+import difflib
+import importlib
+import sys
+from pathlib import Path
+
+from mjx_walk.utils.versions import __version__
+
+COMMANDS = ("train", "eval", "play", "plots", "export", "zoo", "compare", "bench", "parity")
+_PACKAGES = ("zoo",)
+"""Commands that are packages."""
+
+
+def main() -> int:
+    """Run the command that the arguments name, and return the exit code. Without one, list the commands."""
+    command, *arguments = sys.argv[1:] or ["--help"]
+    if command in ("-h", "--help", "help"):
+        print(usage())
+        return 0
+    if command == "--version":
+        print(f"mjx_walk {__version__}")
+        return 0
+    if command not in COMMANDS:
+        near = difflib.get_close_matches(command, COMMANDS, 1, cutoff=0.7)
+        meant = f"train {command}" if "=" in command else near[0] if near else ""
+        hint = f"did you mean: {meant}?" if meant else f"choose one of: {', '.join(COMMANDS)}"
+        print(f"error: unknown command '{command}'; {hint}", file=sys.stderr)
+        return 2
+    from mjx_walk.utils import cli  # imports JAX, which the list of commands does not need
+
+    module = importlib.import_module(f"mjx_walk.{_module(command)}")
+    sys.argv = [f"mjx-walk {command}", *arguments]
+    cli.main(module.main)
+
+
+def usage() -> str:
+    """The commands, each with the example and the sentence of its docstring."""
+    lines = [
+        "usage: mjx-walk COMMAND [KEY=VALUE ...]",
+        "",
+        "The same as python -m mjx_walk.COMMAND [KEY=VALUE ...]. mjx-walk COMMAND --help says more.",
+        "",
+    ]
+    for command in COMMANDS:
+        path = Path(__file__).parent / f"{_module(command).replace('.', '/')}.py"
+        docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        example, _, sentence = docstring.splitlines()[0].partition("`: ")
+        example = example.removeprefix(f"`python -m mjx_walk.{command}").strip()
+        lines += [f"  mjx-walk {command} {example}".rstrip(), f"      {sentence.replace('`', '')}"]
+    return "\n".join(lines)
+
+
+def _module(command: str) -> str:
+    return f"{command}.__main__" if command in _PACKAGES else command
+
+
+if __name__ == "__main__":
+    sys.exit(main())
