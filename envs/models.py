@@ -1,6 +1,7 @@
 """MuJoCo models: where `xml_file` finds one, loading it, and looking up its parts."""
 
 import logging
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -97,6 +98,29 @@ def check_model(model: mujoco.MjModel, task: str, needs: ModelNeeds) -> None:
     for i in np.flatnonzero(~(np.isfinite(low) & np.isfinite(high) & (low < high))):
         motor = model.actuator(int(i)).name or int(i)
         raise UserError(f"motor '{motor}' of the model has no range of controls; give it ctrlrange=\"LOW HIGH\"")
+
+
+def check_pose(model: mujoco.MjModel, derived: Iterable[str]) -> None:
+    """Check that the model can be simulated from its own pose. Huge masses, forces and distances overflow.
+
+    Args:
+        model: the model.
+        derived: names of the `mjData` arrays that the task reads.
+
+    Raises:
+        UserError: a position, an acceleration or an array that the task reads is not finite in float32.
+    """
+    data = mujoco.MjData(model)
+    with hide_deprecations():
+        mujoco.mj_forward(model, data)
+    for name in ("qpos", "qacc", *derived):
+        with np.errstate(over="ignore"):
+            values = np.asarray(getattr(data, name)).astype(np.float32)
+        if not np.isfinite(values).all():
+            raise UserError(
+                f"the model cannot be simulated: {name} is not finite in its own pose; check its masses, sizes, forces "
+                "and positions"
+            )
 
 
 def warn_of_coordinates(model: mujoco.MjModel, task: str, has_x: bool, height: int | None) -> None:

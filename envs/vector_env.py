@@ -5,10 +5,12 @@ from typing import NamedTuple
 import flax
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjx_walk.envs.inline_evaluation import InlineEvaluation, InlineEvaluator
 from mjx_walk.envs.state import State
-from mjx_walk.envs.task import Task
+from mjx_walk.envs.task import MAX_ABS_VALUE, Task
+from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import Metric, Metrics, Reduction
 
 
@@ -147,6 +149,28 @@ class VectorEnv:
         trained = jax.tree.map(lambda x: x[: self.num_envs], envs)
         evaluated = jax.tree.map(lambda x: x[self.num_envs :], envs)
         return trained, self.evaluator.record(evaluation, evaluated)
+
+
+def check_resets(state: VectorState) -> None:
+    """Check the first states and the pool of random starts.
+
+    Args:
+        state: of a new run, with any leading axes.
+
+    Raises:
+        UserError: an observation is not finite, or a position or velocity exceeds `MAX_ABS_VALUE`.
+    """
+    num_resets, num_bad = 0, 0
+    for env in (state.env, state.pool):
+        qpos, qvel, obs = map(np.asarray, (env.physics.qpos, env.physics.qvel, env.obs))
+        is_valid = (np.abs(qpos) < MAX_ABS_VALUE).all(-1) & (np.abs(qvel) < MAX_ABS_VALUE).all(-1)
+        is_valid &= np.isfinite(obs).all(-1)
+        num_resets, num_bad = num_resets + is_valid.size, num_bad + (~is_valid).sum()
+    if num_bad:
+        raise UserError(
+            f"{num_bad:,} of {num_resets:,} resets are not finite, or exceed {MAX_ABS_VALUE:.0e}; lower "
+            "env.reset_noise_scale, or check the model"
+        )
 
 
 def _where(condition: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:

@@ -1,5 +1,6 @@
 """The Python API, which the commands use as well: train a run, load a run."""
 
+import contextlib
 import dataclasses
 import functools
 import logging
@@ -7,7 +8,6 @@ import operator
 import shlex
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax
 import yaml
@@ -20,13 +20,15 @@ from mjx_walk.envs.registry import task_name
 from mjx_walk.envs.user_files import only_known, source_path
 from mjx_walk.evaluation.gymnasium_scores import Episodes, compile_episodes, score_in_gymnasium, score_in_sim
 from mjx_walk.runs import run_folder
-from mjx_walk.runs.config import Config, load_config, read_config
+from mjx_walk.runs.config import Config, load_config
 from mjx_walk.runs.loggers import require_wandb
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.own_tasks import KEY
 from mjx_walk.runs.policies import SavedPolicy, make_task
+from mjx_walk.runs.preparation import prepared
 from mjx_walk.runs.renamed import present_key
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.saved_config import read_saved_config, with_setting
 from mjx_walk.runs.saved_yaml import read_yaml
 from mjx_walk.runs.scores import BEST, Scores
 from mjx_walk.runs.trust import remember, require_trusted
@@ -96,7 +98,7 @@ def load_run(path: str | Path, physics: str | None = None, policy: str = BEST, t
 def _register_for(folder: RunFolder, task: type[Task]) -> None:
     """Register a task under the name that a run has for its own."""
     try:
-        name = str(read_yaml(folder.config).env.name)
+        name = str(read_yaml(folder.config_copy() or folder.config).env.name)
     except (OSError, ValueError, LookupError, AttributeError, RecursionError, yaml.YAMLError):
         return  # the loading says what is wrong
     if name in BUILT_IN_TASKS:
@@ -155,13 +157,13 @@ def train(
     physics = resolve_engine(configs[0].physics)
     configs = [dataclasses.replace(config, physics=physics) for config in configs]
     processes = processes or Processes()
-    with temporary_jax_settings(configs[0].matmul_precision):
+    with temporary_jax_settings(configs[0].matmul_precision), contextlib.ExitStack() as locks:
         task = make_task(configs[0])
         if task.reward_hashes and processes.is_main_process:
             remember(configs[0].env.reward_function, task.reward_hashes)
-        folders, configs = _prepare(configs, task, processes)
+        folders, configs = _prepare(configs, task, processes, locks)
         trainer = Trainer(configs, task, folders, on_metrics, processes)
-        with as_by_ctrl_c():
+        with as_by_ctrl_c(), contextlib.closing(trainer):
             signal_name = trainer.train()
             if not signal_name:
                 _score(trainer, folders)
@@ -170,13 +172,18 @@ def train(
     return folders, signal_name
 
 
-def _prepare(configs: list[Config], task: Task, processes: Processes) -> tuple[list[RunFolder], list[Config]]:
-    """Check that the runs fit this machine, and prepare their folders. All processes get the main one's folder."""
+def _prepare(
+    configs: list[Config], task: Task, processes: Processes, locks: contextlib.ExitStack
+) -> tuple[list[RunFolder], list[Config]]:
+    """Check that the runs fit this machine, and prepare their folders. All processes get the main one's folder.
+
+    The main process locks the folders until `locks` is closed.
+    """
     algorithm = make_algorithm(task, configs[0].num_envs, configs[0].evaluation, configs[0].algo)
     replay = check_replay(algorithm, Path(configs[0].run_dir or "."), len(configs))
     folders: list[RunFolder] = []
     if processes.is_main_process:
-        folders, configs = run_folder.prepare(configs)
+        folders, configs = locks.enter_context(prepared(configs))
         _announce(configs[0], folders, processes.process_count)
         if replay:
             _LOGGER.info(replay)
@@ -254,7 +261,7 @@ def _as_saved(config: Config, overrides: list[str]) -> Config:
     given = {present_key(override.partition("=")[0]) for override in overrides}
     if not (config.resume and config.run_dir) or given & {"env", "algo", "recipe"}:
         return config
-    saved = read_config(run_folder.open_existing(config.run_dir).config)
+    saved = read_saved_config(run_folder.open_existing(config.run_dir))
     source = saved.env.reward_function
     if source and "env.reward_function" not in given:
         require_trusted(source)
@@ -263,15 +270,8 @@ def _as_saved(config: Config, overrides: list[str]) -> Config:
         named = shlex.quote(f"wandb_project={project}")
         raise UserError(f"the saved run logs to Weights & Biases; to go on, add {named}, or wandb_project=null")
     for key in given - {"hardware"} | {"run_dir", "resume"}:
-        saved = _with_setting(saved, key, operator.attrgetter(key)(config))
+        saved = with_setting(saved, key, operator.attrgetter(key)(config))
     return saved
-
-
-def _with_setting(settings: Any, key: str, value: Any) -> Any:
-    """Replace a value of nested dataclasses by its key, such as `evaluation.films`."""
-    name, _, rest = key.partition(".")
-    own = _with_setting(getattr(settings, name), rest, value) if rest else value
-    return dataclasses.replace(settings, **{name: own})
 
 
 def _announce(config: Config, folders: list[RunFolder], num_devices: int) -> None:

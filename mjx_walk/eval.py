@@ -6,8 +6,9 @@ import warnings
 from mjx_walk import zoo
 from mjx_walk.api import Run, load_run
 from mjx_walk.runs.own_tasks import take_task
+from mjx_walk.runs.policies import default_policy
 from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.scores import BEST, FINAL, POLICIES, Scores, read_scores, write_scores
+from mjx_walk.runs.scores import POLICIES, Scores, read_scores, write_scores
 from mjx_walk.training.summary import score_lines
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
@@ -41,7 +42,7 @@ def main(command_line: list[str]) -> None:
     if arguments.physics and arguments.backend == "gymnasium":
         raise UserError(f"physics={arguments.physics} needs backend=sim: Gymnasium has its own engine")
     folder = zoo.open_run(arguments.run)
-    name = arguments.policy or (FINAL if folder.policy(FINAL).exists() else BEST)
+    name = arguments.policy or default_policy(folder)
     run = load_run(folder.path, arguments.physics, name)
     is_saved = arguments.backend == "gymnasium" and not zoo.holds(folder.path)
     if is_saved:

@@ -8,6 +8,7 @@ import runpy
 import subprocess
 import sys
 import threading
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.algos.on_policy import OnPolicyConfig
 from mjx_walk.envs import registry
 from mjx_walk.runs import checkpoint
+from mjx_walk.runs.facts import read_facts, write_facts
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing import rendering
 
@@ -191,6 +193,17 @@ def flip_a_byte(folder):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(data)
+
+
+def edit_config(run_dir, old, new):
+    """Change the configuration of a run and all copies of it, with their checksums, as a stranger could."""
+    for path in (run_dir / "config.yaml", *run_dir.rglob("run_config.yaml")):
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+        meta = path.parent / "meta.json"
+        if meta.exists():
+            write_facts(meta, read_facts(meta) | {"config_crc32": zlib.crc32(path.read_bytes())})
 
 
 @contextlib.contextmanager

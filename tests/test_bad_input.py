@@ -7,8 +7,7 @@ import subprocess
 import sys
 
 import pytest
-import yaml
-from helpers import TINY, TINY_CALL, command, command_here
+from helpers import TINY, TINY_CALL, command, command_here, edit_config
 
 from mjx_walk import api
 from mjx_walk import bench as bench_command
@@ -224,15 +223,14 @@ def test_a_policy_of_another_environment_is_refused(finished, tmp_path):
 
     copy = tmp_path / "copy"
     shutil.copytree(finished, copy)
-    config = yaml.safe_load((copy / "config.yaml").read_text())
-    config["env"]["exclude_current_positions_from_observation"] = False
-    (copy / "config.yaml").write_text(yaml.safe_dump(config))
+    setting = "exclude_current_positions_from_observation"
+    edit_config(copy, f"{setting}: true", f"{setting}: false")
     with pytest.raises(UserError, match=r"belongs to another run or version: .* should be \(18"):
         api.load_run(copy)
+    shutil.rmtree(copy / "checkpoints")
     (copy / "config.yaml").write_text("not: ours\n")
     with pytest.raises(UserError, match="not a configuration of this version"):
         api.load_run(copy)
-    shutil.rmtree(copy / "checkpoints")
     shutil.copy(finished / "config.yaml", copy / "config.yaml")
     with pytest.raises(UserError, match="holds no policy yet"):
         api.load_run(copy)

@@ -7,7 +7,7 @@ from typing import Any
 
 from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
 from mjx_walk.algos.a2c import A2C, A2CConfig
-from mjx_walk.algos.base import Algorithm, TrainState, is_finite, learned_leaves
+from mjx_walk.algos.base import Algorithm, TrainState, is_finite, learned_leaves, without_replay
 from mjx_walk.algos.csac import CSAC, CSACConfig
 from mjx_walk.algos.ddpg import DDPG, DDPGConfig
 from mjx_walk.algos.off_policy import OffPolicyConfig
@@ -44,6 +44,7 @@ __all__ = [
     "learned_leaves",
     "make_algorithm",
     "register_algorithm",
+    "without_replay",
 ]
 
 

@@ -44,6 +44,12 @@ def is_finite(state: TrainState) -> jax.Array:
     return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in learned_leaves(state).values()]))
 
 
+def without_replay(state: Any) -> Any:
+    """A TrainState, or its shapes, without the replay buffer."""
+    fields = {field.name: () for field in dataclasses.fields(state) if field.metadata.get("replay")}
+    return state.replace(**fields)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Algorithm(abc.ABC):
     """A learning algorithm for one task, as pure functions of a `TrainState`.

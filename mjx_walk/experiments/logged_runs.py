@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
-from mjx_walk.runs.config import Config, flatten, read_config
+from mjx_walk.runs.config import Config, flatten
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.run_folder import RunFolder, open_existing
+from mjx_walk.runs.saved_config import read_saved_config
 from mjx_walk.runs.scores import BEST, BETTER, ScoreFile, read_scores
 from mjx_walk.utils.errors import UserError
 
@@ -65,7 +66,7 @@ def read_runs(folder: Path) -> list[LoggedRun]:
         run = open_existing(path.parent)
         rows = read_rows(run.metrics)
         if rows:
-            runs.append(LoggedRun(read_config(path), rows, _scores(run)))
+            runs.append(LoggedRun(read_saved_config(run), rows, _scores(run)))
     if not runs:
         raise UserError(f"no runs below '{folder}' have logged anything yet")
     return runs

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import fcntl
 import itertools
 import os
 import re
@@ -18,13 +17,15 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import Config, load_config, read_config
+from mjx_walk.runs.config import Config, load_config
 from mjx_walk.runs.metrics import read_rows
 from mjx_walk.runs.overrides import complete_overrides, sweep_choices
-from mjx_walk.runs.run_folder import RunFolder, differences, in_short
+from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.saved_config import differences, in_short, read_saved_config
 from mjx_walk.utils.devices import only_device
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import open_to_append, user_path
+from mjx_walk.utils.locks import locked
 from mjx_walk.utils.signals import Interrupt
 from mjx_walk.utils.subprocesses import start_module
 from mjx_walk.utils.text import format_score
@@ -62,7 +63,7 @@ class PlannedRun:
     @property
     def is_finished(self) -> bool:
         """Whether it has logged all its steps, and been scored if its settings ask for that."""
-        rows = read_rows(self.folder.metrics) if self.folder.config.exists() else []
+        rows = read_rows(self.folder.metrics) if self.folder.is_run else []
         if not rows or rows[-1]["env_steps"] < self.config.total_steps:
             return False
         return not self.config.evaluation.gymnasium_episodes or self.folder.gymnasium_scores.exists()
@@ -137,9 +138,9 @@ def _choices(overrides: list[str], hardware: str) -> list[list[str]]:
 
 
 def _check_same_configuration(run: PlannedRun) -> None:
-    if not run.folder.config.exists():
+    if not run.folder.is_run:
         return
-    saved = read_config(run.folder.config)
+    saved = read_saved_config(run.folder)
     differing = differences(saved, dataclasses.replace(run.config, physics=resolve_engine(run.config.physics)))
     if run.config.total_steps < saved.total_steps:
         differing.append("total_steps, which may only grow")
@@ -186,7 +187,7 @@ def start_job(job: list[PlannedRun], log: Path, device: int | None, share: int, 
     first = job[0]
     is_resumed = first.steps_saved is not None
     for run in job:
-        if not is_resumed and run.folder.config.exists():
+        if not is_resumed and run.folder.is_run:
             shutil.rmtree(run.folder.path)  # it ended before its first checkpoint
     env = only_device(device) if device is not None else {}
     if share > 1 and "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:
@@ -262,14 +263,11 @@ def _lock(folder: Path) -> Iterator[int]:
     Raises:
         UserError: another comparison holds the lock, or the folder cannot be written to.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = os.fdopen(open_to_append(folder / "lock"), "a")
-    except OSError as error:
-        raise UserError(f"cannot write to {folder}: {error.strerror}") from error
-    with file:
+    in_use = f"runs of {folder.parent} are still being trained; wait for them, or stop them"
+    with contextlib.ExitStack() as held:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = held.enter_context(locked(folder / "lock", in_use))
         except OSError as error:
-            raise UserError(f"runs of {folder.parent} are still being trained; wait for them, or stop them") from error
-        yield file.fileno()
+            raise UserError(f"cannot write to {folder}: {error.strerror}") from error
+        yield lock

@@ -3,9 +3,15 @@
 A reader trusts no file: before it reads an array, it compares the declared shape and type with the expected ones.
 """
 
+import contextlib
+import errno
+import logging
 import math
+import os
+import re
+import shutil
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,16 +43,54 @@ def write_arrays(path: Path, arrays: HostArrays, as_numpy: bool = False) -> None
         path: of the folder.
         arrays: arrays of any dtype, by name.
         as_numpy: write one compressed NumPy file instead of Orbax's files.
+
+    Raises:
+        OSError: writing failed, for example because the disk is full.
     """
     path = path.resolve()
+    _check_space(path.parent, sum(array.nbytes for array in arrays.values()))
     # Orbax writes host arrays only from the main process.
     if as_numpy or jax.process_index() or _NOT_FOR_ORBAX & {*str(path)}:
         path.mkdir()
         write = np.savez_compressed if as_numpy else np.savez
         write(path / _NUMPY, allow_pickle=False, **arrays)
         return
-    with _checkpointer() as checkpointer:
+    with _as_os_error(path), _without_logs_of_orbax(), _checkpointer() as checkpointer:
         checkpointer.save(path, arrays)
+
+
+def _check_space(folder: Path, num_bytes: int) -> None:
+    """Check that a disk has room for arrays. Orbax leaves threads behind if it has not."""
+    disk = shutil.disk_usage(folder)
+    if disk.total and disk.free < num_bytes:  # some network file systems do not know their size
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+
+
+@contextlib.contextmanager
+def _as_os_error(path: Path) -> Iterator[None]:
+    """Context manager that turns TensorStore's error about a file into an `OSError`."""
+    try:
+        yield
+    except ValueError as error:
+        code = re.search(r"os_error_code='(\d+)'", str(error))
+        if not code:
+            raise
+        raise OSError(int(code[1]), os.strerror(int(code[1])), str(path)) from error
+
+
+@contextlib.contextmanager
+def _without_logs_of_orbax() -> Iterator[None]:
+    """Context manager that hides the tracebacks that Orbax logs from its threads. It raises the same errors."""
+    logger = logging.getLogger("absl")
+    logger.addFilter(_is_no_error)
+    try:
+        yield
+    finally:
+        logger.removeFilter(_is_no_error)
+
+
+def _is_no_error(record: logging.LogRecord) -> bool:
+    return record.levelno < logging.ERROR
 
 
 def read_arrays(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:

@@ -1,17 +1,12 @@
-"""Save and restore a complete TrainState with Orbax, atomically and with a checksum for each leaf.
+"""Save and restore a complete TrainState with Orbax, atomically and with checksums.
 
 Orbax's CheckpointManager treats all parts of a step alike and synchronizes all processes at each save. Here, only the
 newest step keeps its replay buffer, and each process writes its own folder.
 """
 
-import contextlib
-import json
-import os
-import shutil
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_walk.runs.arrays import HostArrays, read_arrays, write_arrays
-from mjx_walk.runs.facts import read_facts
+from mjx_walk.runs.facts import FORMAT, read_facts, write_facts
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import fresh_name, write_text
+from mjx_walk.utils.files import write_text
+from mjx_walk.utils.folders import discard, find_written, remove_unfinished, replacing_folder
 from mjx_walk.utils.versions import __version__
 
-FORMAT = 1
-"""Version of the checkpoint format. Increment it when a change makes older checkpoints unreadable."""
-
 _META = "meta.json"
+"""File that is written last."""
 _ARRAYS = "arrays"
-_UNFINISHED = ".unfinished"
-"""Suffix of folders that a save has not completed, or has replaced."""
+_CONFIG = "run_config.yaml"
+"""Copy of the run's configuration. Earlier versions wrote none."""
+_CONFIG_CHECKSUM = "config_crc32"
 _REPLAY = "replay"
 """Field of the TrainState that only the newest checkpoint keeps, and the name of its folder."""
 
@@ -51,7 +46,7 @@ def to_host(tree: Any) -> HostArrays:
     return {name: np.array(leaf) for name, leaf in _named_leaves(jax.device_get(tree)).items()}
 
 
-def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False) -> None:
+def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False, config: str | None = None) -> None:
     """Write a pytree of arrays. The folder gets its name only when it is complete.
 
     Args:
@@ -59,20 +54,47 @@ def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False) ->
         tree: arrays of any dtype, or the result of `to_host`.
         meta: JSON-serializable facts to store with the arrays; version and checksums are added.
         as_numpy: write one compressed NumPy file instead of Orbax's folder.
+        config: text of the configuration, of which the folder gets a copy.
+
+    Raises:
+        OSError: writing failed, for example because the disk is full.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
-    meta = meta | {
-        "format": FORMAT,
-        "mjx_walk": __version__,
-        "crc32": {name: _crc32(x) for name, x in arrays.items()},
-    }
+    meta = meta | {"crc32": {name: _crc32(x) for name, x in arrays.items()}}
     replay = {name: x for name, x in arrays.items() if _is_replay(name)}
-    with _replacing_folder(path) as unfinished:
+    with replacing_folder(path) as unfinished:
         rest = {name: x for name, x in arrays.items() if name not in replay}
         write_arrays(unfinished / _ARRAYS, rest, as_numpy)
         if replay:
             write_arrays(unfinished / _REPLAY, replay, as_numpy)
-        write_text(unfinished / _META, json.dumps(meta))
+        if config is not None:
+            write_text(unfinished / _CONFIG, config)
+            meta[_CONFIG_CHECKSUM] = zlib.crc32(config.encode())
+        write_facts(unfinished / _META, meta)
+
+
+def find(path: Path) -> Path | None:
+    """The folder that was saved at `path`, also if a crash has left it without its name. None if there is none."""
+    return find_written(path, _META)
+
+
+def config_copy(path: Path) -> Path | None:
+    """The copy of the configuration that a checkpoint holds; None in checkpoints of earlier versions.
+
+    Raises:
+        ValueError: the copy or the facts are damaged.
+    """
+    checksum = read_meta(path).get(_CONFIG_CHECKSUM)
+    if checksum is None:
+        return None
+    copy = path / _CONFIG
+    try:
+        is_damaged = zlib.crc32(copy.read_bytes()) != checksum
+    except OSError as error:
+        raise ValueError(f"{path} is damaged: {copy.name}: {error.strerror}") from error
+    if is_damaged:
+        raise ValueError(f"{path} is damaged: {copy.name} does not match its checksum")
+    return copy
 
 
 def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
@@ -96,17 +118,21 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
             f"{path} has checkpoint format {meta.get('format')}, written by mjx_walk {meta.get('mjx_walk')}; "
             f"mjx_walk {__version__} reads format {FORMAT}; install the version that wrote it, or train again"
         )
+    config_copy(path)
     wanted = _named_leaves(like)
     meta["crc32"] = {present_name(name): crc for name, crc in meta["crc32"].items()}
     arrays = read_arrays(path / _ARRAYS, wanted, present_name)
-    if any(_is_replay(name) for name in meta["crc32"]):
+    if any(_is_replay(name) for name in meta["crc32"]) and any(map(_is_replay, wanted)):
         if (path / _REPLAY).exists():
             arrays |= read_arrays(path / _REPLAY, wanted, present_name)
         else:
             warnings.warn(f"{path} has no replay buffer; training refills it before learning continues", stacklevel=2)
-            arrays |= {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in wanted.items() if _is_replay(name)}
-            meta["crc32"] = {name: crc for name, crc in meta["crc32"].items() if not _is_replay(name)}
+            empty = {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in wanted.items() if _is_replay(name)}
+            arrays |= empty
+            meta["crc32"] |= {name: _crc32(array) for name, array in empty.items()}
     for name, leaf in wanted.items():
+        if name in arrays and name not in meta["crc32"]:
+            raise ValueError(f"{path} is damaged: {name} has no checksum")
         if name in meta["crc32"] and (name not in arrays or _crc32(arrays[name]) != meta["crc32"][name]):
             raise ValueError(f"{path} is damaged: {name} does not match its checksum")
         if name not in arrays:
@@ -150,7 +176,7 @@ def restore_newest(
     part: Callable[[Path], Path] = lambda path: path,
     agree: Callable[[bool], bool] = lambda is_complete: is_complete,
 ) -> tuple[Any, dict[str, Any]]:
-    """Restore the newest complete checkpoint. Skips damaged ones with a warning.
+    """Restore the newest complete checkpoint. Skips those that cannot be read, with a warning.
 
     Args:
         folder: folder of the checkpoints.
@@ -159,19 +185,32 @@ def restore_newest(
         agree: maps whether the part is complete to whether to use the checkpoint. Called once per checkpoint.
 
     Raises:
-        UserError: there is no usable checkpoint, or it belongs to another run.
+        UserError: there is no usable checkpoint, or the newest belongs to another run and no other one is usable.
     """
+    problems: list[ValueError] = []
     for path in reversed(list_steps(folder)):
         found = None
         try:
             found = restore(part(path), like)
-        except UserError:
-            raise
+            _check_steps(path, found[1])
         except ValueError as error:
-            warnings.warn(f"{error}; falling back to the previous checkpoint", stacklevel=2)
+            found = None
+            problems.append(error)
         if agree(found is not None) and found:
+            for problem in problems:
+                warnings.warn(f"{problem}; falling back to the previous checkpoint", stacklevel=2)
             return found
+    if problems and isinstance(problems[0], UserError):
+        raise problems[0]
+    for problem in problems:
+        warnings.warn(str(problem), stacklevel=2)
     raise UserError(f"no usable checkpoint in {folder}; start a new run without resume=true")
+
+
+def _check_steps(path: Path, meta: dict[str, Any]) -> None:
+    """Check that a checkpoint is the one that its name says. Facts of earlier versions have no checksum."""
+    if meta["env_steps"] != int(path.name):
+        raise ValueError(f"{path} is damaged: its facts are of step {meta['env_steps']}")
 
 
 def prune(folder: Path, keep: int, newest: str | None = None) -> None:
@@ -184,81 +223,14 @@ def prune(folder: Path, keep: int, newest: str | None = None) -> None:
     """
     for path in list_steps(folder):
         if newest and path.name > newest:
-            shutil.rmtree(path)
+            discard(path)
     for path in list_steps(folder)[:-keep]:
-        shutil.rmtree(path)
+        discard(path)
     for path in list_steps(folder)[:-1]:
-        shutil.rmtree(path / _REPLAY, ignore_errors=True)
-    for path in folder.glob(f".*{_UNFINISHED}"):
-        _remove(path)
-
-
-class BackgroundSaver:
-    """Writes checkpoints in the background, one at a time. Training waits only for the copy to the host."""
-
-    def __init__(self, folder: Path, keep: int):
-        """
-        Args:
-            folder: folder of the checkpoints.
-            keep: number of newest checkpoints to keep.
-        """
-        self._folder = folder
-        self._keep = keep
-        self._executor = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
-        self._running: Future[None] | None = None
-
-    def save(self, *parts: tuple[Path, Any, dict[str, Any]]) -> None:
-        """Copy pytrees to the host and start to write them in order. Waits for the previous save first.
-
-        Args:
-            parts: arguments of `checkpoint.save` for each pytree.
-        """
-        self.wait()
-        copied = [(path, to_host(tree), meta) for path, tree, meta in parts]
-        self._running = self._executor.submit(self._save, copied)
-
-    def wait(self) -> None:
-        """Wait until the current save is complete.
-
-        Raises:
-            OSError: writing failed, for example because the disk is full.
-        """
-        if self._running:
-            self._running.result()
-            self._running = None
-
-    def _save(self, parts: list[tuple[Path, HostArrays, dict[str, Any]]]) -> None:
-        for path, arrays, meta in parts:
-            save(path, arrays, meta)
-        prune(self._folder, self._keep, max((path.name for path, *_ in parts if path.name.isdigit()), default=None))
-
-
-@contextlib.contextmanager
-def _replacing_folder(path: Path) -> Iterator[Path]:
-    """Context manager for writing a folder under a fresh name. On success it replaces `path`, else it is removed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished, former = (fresh_name(path.with_suffix(_UNFINISHED)) for _ in range(2))
-    unfinished.mkdir()
-    try:
-        yield unfinished
-        if path.exists():
-            os.replace(path, former)  # atomic, unlike removing a folder
-        os.replace(unfinished, path)
-    except BaseException:
-        if former.exists():
-            os.replace(former, path)
-        raise
-    finally:
-        _remove(former)
-        _remove(unfinished)
-
-
-def _remove(path: Path) -> None:
-    """Remove a folder, or a file that stands in its place, if there is one."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
+        if (path / _REPLAY).exists():
+            discard(path / _REPLAY)
+        remove_unfinished(path, _META)
+    remove_unfinished(folder, _META)
 
 
 def _is_replay(name: str) -> bool:

@@ -19,12 +19,10 @@ from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import ENGINES
 from mjx_walk.runs.overrides import complete_overrides
-from mjx_walk.runs.own_tasks import find_saved_task
 from mjx_walk.runs.recipes import CONFIG_DIR, fitting_recipes, recipe_names
-from mjx_walk.runs.renamed import present_overrides, under_present_names
-from mjx_walk.runs.saved_yaml import read_yaml
+from mjx_walk.runs.renamed import present_overrides
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import user_path, write_text
+from mjx_walk.utils.files import user_path
 from mjx_walk.utils.settings import has_effect, refuse_ineffective, setting, validate
 
 __all__ = [
@@ -34,10 +32,8 @@ __all__ = [
     "compose_config",
     "flatten",
     "load_config",
-    "read_config",
     "recipe_names",
     "register_schemas",
-    "save_config",
     "to_config",
     "training_command",
     "with_absolute_paths",
@@ -179,37 +175,6 @@ def flatten(config: Config) -> dict[str, Any]:
                 yield prefix + key, item
 
     return dict(walk(yaml.safe_load(OmegaConf.to_yaml(OmegaConf.structured(config))), ""))
-
-
-def save_config(config: Config, path: Path) -> None:
-    """Write a configuration as YAML."""
-    write_text(path, OmegaConf.to_yaml(OmegaConf.structured(config)))
-
-
-def read_config(path: Path) -> Config:
-    """Read a configuration that `save_config` wrote, under the present or the former names of its settings.
-
-    Raises:
-        UserError: the file is not a configuration that this version reads.
-    """
-    try:
-        saved = under_present_names(read_yaml(path))
-        find_saved_task(saved.env.name, saved.env.get("task"), path)
-        if saved.algo.name not in ALGORITHMS:
-            raise UserError(f"the algorithm '{saved.algo.name}' of {path} is not known here; {_HOW_TO_REGISTER}")
-        schema = OmegaConf.structured(Config(env=TASKS[saved.env.name][1](), algo=ALGORITHMS[saved.algo.name][1]()))
-        return to_config(OmegaConf.merge(schema, saved))
-    except UserError:
-        raise
-    except _UNREADABLE as error:
-        raise UserError(f"{path} is not a configuration of this version: {_first_line(error)}") from error
-
-
-_HOW_TO_REGISTER = "call mjx_walk.register_algorithm before load_run, or in the FILE.py of env.task=FILE.py:CLASS"
-_UNREADABLE = (
-    *(LookupError, AttributeError, TypeError, ValueError, RecursionError),
-    *(yaml.YAMLError, OmegaConfBaseException),
-)
 
 
 def _first_line(error: BaseException) -> str:

@@ -1,22 +1,40 @@
 """The facts stored with a checkpoint, checked before they are used: the file may come from anywhere."""
 
 import json
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["read_facts"]
+from mjx_walk.utils.files import write_text
+from mjx_walk.utils.versions import __version__
 
+__all__ = ["FORMAT", "read_facts", "write_facts"]
+
+FORMAT = 1
+"""Version of the checkpoint format. Increment it when a change makes older checkpoints unreadable."""
+
+_CHECKSUM = "checksum"
+"""Name of the checksum of all other facts. Earlier versions wrote none."""
 _MAX_BYTES = 10_000_000
 _MAX_NUMBER = 1e300
 _REQUIRED = ("env_steps", "crc32")
 
 
+def write_facts(path: Path, facts: dict[str, Any]) -> None:
+    """Write a `meta.json`, with the versions and a checksum."""
+    facts = {"format": FORMAT, "mjx_walk": __version__} | facts
+    write_text(path, json.dumps(facts | {_CHECKSUM: _checksum(facts)}))
+
+
 def read_facts(path: Path) -> dict[str, Any]:
     """Read a `meta.json`. Facts that this version does not know are not checked.
 
+    Returns:
+        The facts. Those of another format than `FORMAT` are returned without a look at the checksum.
+
     Raises:
-        ValueError: the file cannot be read, or a fact is not what it should be.
+        ValueError: the file cannot be read, a fact is not what it should be, or the checksum does not match.
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
@@ -31,7 +49,14 @@ def read_facts(path: Path) -> dict[str, Any]:
             raise ValueError(f"{path}: {name} should be {valid}, found {_shown(facts[name])}")
         if name in _REQUIRED and name not in facts:
             raise ValueError(f"{path}: {name} should be {valid}, found nothing")
+    checksum = facts.pop(_CHECKSUM, None)
+    if checksum is not None and facts.get("format") == FORMAT and checksum != _checksum(facts):
+        raise ValueError(f"{path.parent} is damaged: {path.name} does not match its checksum")
     return facts
+
+
+def _checksum(facts: dict[str, Any]) -> int:
+    return zlib.crc32(json.dumps(facts, sort_keys=True).encode())
 
 
 def _is_count(value: Any, at_least: int = 0) -> bool:
@@ -47,6 +72,9 @@ _FACTS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "wall_seconds": (lambda value: _is_finite(value) and value >= 0, "a number from 0"),
     "num_devices": (lambda value: _is_count(value, 1) and value <= 10**6, "a whole number from 1 to 1,000,000"),
     "eval_return": (_is_finite, "a finite number"),
+    "log_rows": (_is_count, "a whole number from 0"),
+    "log_crc32": (_is_count, "a whole number from 0"),
+    "config_crc32": (_is_count, "a whole number from 0"),
     "format": (_is_count, "a whole number from 0"),
     "mjx_walk": (lambda value: isinstance(value, str) and value.isprintable() and len(value) < 100, "a version"),
     "crc32": (lambda value: isinstance(value, dict) and all(map(_is_count, value.values())), "whole numbers by name"),

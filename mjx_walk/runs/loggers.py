@@ -1,5 +1,7 @@
 """Loggers for the rows of a run: `metrics.jsonl`, TensorBoard, Weights & Biases, the terminal."""
 
+import contextlib
+import errno
 import importlib.util
 import json
 import logging
@@ -9,6 +11,9 @@ import re
 import secrets
 import sys
 import time
+import warnings
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +22,9 @@ from tqdm import tqdm
 from mjx_walk.runs.config import Config, flatten
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.tensorboard import SummaryWriter
+from mjx_walk.runs.tensorboard import EventFile
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import open_to_append, write_text
+from mjx_walk.utils.files import Appender, replacing, write_text
 from mjx_walk.utils.text import format_score
 
 __all__ = ["MetricsWriter", "Progress", "WandbLog", "require_wandb"]
@@ -27,37 +32,90 @@ __all__ = ["MetricsWriter", "Progress", "WandbLog", "require_wandb"]
 _PROGRESS = logging.getLogger("mjx_walk.progress")
 _SECONDS_BETWEEN_LINES = 10.0
 """Interval of progress lines outside a terminal."""
+_LOG_ROWS, _LOG_CHECKSUM = "log_rows", "log_crc32"
 
 
 class MetricsWriter:
     """Appends rows to `metrics.jsonl` and to TensorBoard's event file."""
 
-    def __init__(self, run_dir: Path, resume_steps: int | None = None):
+    def __init__(self, run_dir: Path, resume_steps: int | None = None, mark: Mapping[str, Any] | None = None):
         """
         Args:
             run_dir: the run folder.
             resume_steps: environment steps at which the run resumes. Later rows of the interrupted run are dropped.
+            mark: `mark` when the checkpoint was saved. A warning says if the rows up to there are others now.
         """
-        path = run_dir / "metrics.jsonl"
+        self._run_dir = run_dir
+        self._path = run_dir / "metrics.jsonl"
+        self._num_rows, self._checksum = 0, 0
         if resume_steps is not None:
-            rows = [row for row in read_rows(path) if row["env_steps"] <= resume_steps]
-            write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
-        self._file = os.fdopen(open_to_append(path), "a", buffering=1)
-        self._events = SummaryWriter(
-            str(run_dir), flush_secs=30, purge_step=None if resume_steps is None else resume_steps + 1
-        )
+            self._drop_later_rows(resume_steps, mark or {})
+        self._folder = os.stat(run_dir)
+        self._file = Appender(self._path)
+        self._events = EventFile(run_dir, resume_steps)
+
+    @property
+    def mark(self) -> dict[str, int]:
+        """Number and checksum of the rows so far, as facts of a checkpoint."""
+        return {_LOG_ROWS: self._num_rows, _LOG_CHECKSUM: self._checksum}
 
     def write(self, row: Row) -> None:
-        """Write one row. `env_steps` is its position on the horizontal axis."""
-        self._file.write(json.dumps({k: v if math.isfinite(v) else None for k, v in row.items()}) + "\n")
-        for name, value in row.items():
-            if "/" in name and math.isfinite(value):
-                self._events.add_scalar(name, value, int(row["env_steps"]))
+        """Write one row. `env_steps` is its position on the horizontal axis.
+
+        Raises:
+            OSError: the run folder has vanished, or the row cannot be written.
+        """
+        if not self._file.is_in_place:
+            self._reopen(row)
+        line = _as_line({name: value if math.isfinite(value) else None for name, value in row.items()})
+        self._file.append(line)
+        self._count(line)
+        values = {name: value for name, value in row.items() if "/" in name and math.isfinite(value)}
+        self._events.add(values, int(row["env_steps"]))
+
+    def sync(self) -> None:
+        """Wait until all rows are on the disk."""
+        self._file.sync()
 
     def close(self) -> None:
         """Close both files."""
         self._file.close()
         self._events.close()
+
+    def _count(self, line: bytes) -> None:
+        self._num_rows += 1
+        self._checksum = zlib.crc32(line, self._checksum)
+
+    def _drop_later_rows(self, resume_steps: int, mark: Mapping[str, Any]) -> None:
+        lines = [_as_line(row) for row in read_rows(self._path) if row["env_steps"] <= resume_steps]
+        for line in lines:
+            self._count(line)
+        expected = mark.get(_LOG_ROWS, len(lines))
+        if len(lines) < expected:
+            warnings.warn(
+                f"{self._path} has lost {expected - len(lines)} of {expected} rows up to step {resume_steps:,}; the "
+                "training continues without them",
+                stacklevel=4,
+            )
+        elif mark.get(_LOG_CHECKSUM, self._checksum) != self._checksum:
+            warnings.warn(f"{self._path} was changed after the run wrote it, up to step {resume_steps:,}", stacklevel=4)
+        with replacing(self._path) as new:
+            new.write_bytes(b"".join(lines))
+
+    def _reopen(self, row: Row) -> None:
+        """Go on in a new file if the old one was removed or replaced, but not in another folder."""
+        folder = os.stat(self._run_dir)
+        if not os.path.samestat(folder, self._folder):
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self._run_dir))
+        warnings.warn(
+            f"{self._path} was removed or replaced; its rows before step {row['env_steps']:,.0f} are gone", stacklevel=4
+        )
+        self._file.close()
+        self._file = Appender(self._path)
+
+
+def _as_line(row: Mapping[str, float | None]) -> bytes:
+    return f"{json.dumps(row)}\n".encode()
 
 
 def require_wandb(config: Config) -> None:
@@ -144,8 +202,7 @@ class Progress:
         if self._evaluated is not None:
             shown["eval"] = format_score(self._evaluated)
         if self._is_terminal:
-            self._bar.set_postfix(shown, refresh=False)
-            self._bar.update(int(row["env_steps"]) - self._bar.n)
+            self._draw(shown, int(row["env_steps"]))
         elif "eval/return" in row or time.monotonic() - self._last_line > _SECONDS_BETWEEN_LINES:
             self._last_line = time.monotonic()
             left = (self._total - row["env_steps"]) / max(row["speed/steps_per_second"], 1e-9)
@@ -154,6 +211,15 @@ class Progress:
             steps, left = row["env_steps"], max(left, 0)
             _PROGRESS.info("%s", f"{steps:>13,.0f} steps  {rate:>9,.0f}/s  {text}  {left:,.0f} s left")
 
+    def _draw(self, shown: dict[str, str], env_steps: int) -> None:
+        """Move the bar. A terminal that has closed shows no more of it, and the training continues."""
+        try:
+            self._bar.set_postfix(shown, refresh=False)
+            self._bar.update(env_steps - self._bar.n)
+        except OSError:
+            self._bar.disable = True
+
     def close(self) -> None:
         """Leave the bar as it is."""
-        self._bar.close()
+        with contextlib.suppress(OSError):
+            self._bar.close()

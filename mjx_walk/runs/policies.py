@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import logging
+import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -10,17 +12,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_walk.algos import Algorithm, make_algorithm
+from mjx_walk.algos import Algorithm, TrainState, make_algorithm, without_replay
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import Config, read_config
+from mjx_walk.runs.config import Config
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.saved_config import read_saved_config
 from mjx_walk.runs.scores import BEST, FINAL, POLICIES
 from mjx_walk.utils.compat import standard_settings
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["SavedPolicy", "deterministic_act", "make_acting_algorithm", "make_task"]
+__all__ = [
+    "SavedPolicy",
+    "best_policy",
+    "default_policy",
+    "deterministic_act",
+    "make_acting_algorithm",
+    "make_task",
+]
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -41,17 +51,15 @@ class SavedPolicy:
             UserError: no usable policy.
         """
         self.path = folder.path
-        saved = read_config(folder.config)
+        saved = read_saved_config(folder)
         self.reward_function = saved.env.reward_function
         """`PATH.py:FUNCTION` of the training, which is not loaded."""
         self.config = _without_reward_function(saved)
         self._physics = physics
         self._build()
-        state = jax.eval_shape(self.algorithm.init, jax.random.PRNGKey(0))
-        like = jax.eval_shape(self.algorithm.policy_params, state)
         self.policy_name = choose_policy(folder, policy)
         """`final` or `best`."""
-        self.policy_params, self.policy_facts = load_policy(folder, self.policy_name, like)
+        self.policy_params, self.policy_facts = _load(folder, self.policy_name, self.algorithm)
 
     def _build(self) -> None:
         engine = self._physics or _engine_here(self.config.physics)
@@ -113,30 +121,71 @@ def choose_policy(folder: RunFolder, name: str) -> str:
     """
     if name not in POLICIES:
         raise UserError(f"policy={name}: choose one of: {', '.join(POLICIES)}")
-    kept = [present for present in POLICIES if folder.policy(present).exists()]
-    if not kept:
-        raise UserError(f"{folder.path} holds no policy yet; train it first")
+    kept = [present for present in POLICIES if checkpoint.find(folder.policy(present))]
     if name in kept:
         return name
-    if name == FINAL:
+    if name == FINAL and kept and not checkpoint.list_steps(folder.checkpoints):
         raise UserError(f"{folder.path} has kept only its best policy; choose policy=best")
-    _LOGGER.info("No evaluation during training has ended yet: this is the final policy.")
-    return FINAL
+    if FINAL in kept:
+        _LOGGER.info("No evaluation during training has ended yet: this is the final policy.")
+        return FINAL
+    if not checkpoint.list_steps(folder.checkpoints):
+        raise UserError(f"{folder.path} holds no policy yet; train it first")
+    return name
+
+
+def default_policy(folder: RunFolder) -> str:
+    """`final`, or `best` for a folder that has kept only that one, as those of the zoo."""
+    final, best = (checkpoint.find(folder.policy(name)) for name in (FINAL, BEST))
+    return BEST if best and not final else FINAL
+
+
+def _load(folder: RunFolder, name: str, algorithm: Algorithm) -> tuple[Any, dict[str, Any]]:
+    """A policy that a run has kept; if it is damaged, the one in the newest checkpoint that is complete."""
+    state = jax.eval_shape(algorithm.init, jax.random.PRNGKey(0))
+    try:
+        return load_policy(folder, name, jax.eval_shape(algorithm.policy_params, state))
+    except UserError as error:
+        try:
+            state, facts = checkpoint.restore_newest(folder.checkpoints, without_replay(state))
+        except UserError:
+            raise error from None
+        warnings.warn(f"{error}; the policy of the checkpoint at step {facts['env_steps']:,} is used", stacklevel=2)
+    num_devices = facts.get("num_devices", 1)
+    best = best_policy(state, algorithm.steps_per_iteration * num_devices) if name == BEST else None
+    return best or (algorithm.policy_params(state), {"env_steps": facts["env_steps"]})
 
 
 def load_policy(folder: RunFolder, name: str, like: Any) -> tuple[Any, dict[str, Any]]:
     """A policy that a run has kept, its `env_steps`, and `eval_return` if an evaluation during training chose it.
 
     Raises:
-        UserError: the policy is damaged, or it belongs to another environment.
+        UserError: the policy is missing or damaged, or it belongs to another environment.
     """
+    path = checkpoint.find(folder.policy(name))
+    if path is None:
+        raise UserError(f"{folder.policy(name)} is missing")
     try:
-        params, meta = checkpoint.restore(folder.policy(name), like)
+        params, meta = checkpoint.restore(path, like)
     except UserError:
         raise
     except ValueError as error:
         raise UserError(str(error)) from error
     return params, {name: meta[name] for name in ("env_steps", "eval_return") if name in meta}
+
+
+def best_policy(state: TrainState, steps_per_iteration: int) -> tuple[Any, dict[str, Any]] | None:
+    """Policy with the highest inline evaluation, and its facts. None until the first evaluation ends.
+
+    Args:
+        state: a TrainState.
+        steps_per_iteration: environment steps of an iteration, over all devices.
+    """
+    evaluation = state.evaluation
+    if math.isinf(evaluation.best_return):
+        return None
+    env_steps = int(evaluation.best_iteration) * steps_per_iteration
+    return evaluation.best_policy_params, {"env_steps": env_steps, "eval_return": float(evaluation.best_return)}
 
 
 def _engine_here(name: str) -> str:

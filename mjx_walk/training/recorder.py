@@ -1,29 +1,35 @@
 """Write the metrics, checkpoints, policies and scores of a run to its folder."""
 
+import contextlib
 import logging
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from mjx_walk.algos import Algorithm, TrainState
 from mjx_walk.envs import Task
 from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium
 from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import Config, save_config
+from mjx_walk.runs.background_saver import BackgroundSaver, Part
+from mjx_walk.runs.config import Config
 from mjx_walk.runs.loggers import MetricsWriter, WandbLog
 from mjx_walk.runs.metrics import Row
-from mjx_walk.runs.policies import deterministic_act, make_acting_algorithm
+from mjx_walk.runs.policies import best_policy, deterministic_act, make_acting_algorithm
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.saved_config import as_yaml, save_config
 from mjx_walk.runs.scores import BEST, FINAL, Scores, write_scores
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.distributed_checkpoint import NUM_DEVICES, device_folder, restore_newest
+from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.film import Filmer
 
 _log = logging.getLogger(__name__)
 
 
 class Recorder:
-    """Writes one run's folder. Processes other than the main one save only their part of the checkpoints."""
+    """Writes one run's folder. Processes other than the main one save only their part of the checkpoints.
+
+    Where a file cannot be written, or the folder has vanished, methods raise `UserError`.
+    """
 
     def __init__(self, config: Config, task: Task, algorithm: Algorithm, folder: RunFolder, processes: Processes):
         """
@@ -39,9 +45,11 @@ class Recorder:
         self._algorithm = algorithm
         self._folder = folder
         self._processes = processes
+        self._steps_per_iteration = algorithm.steps_per_iteration * processes.process_count
         self._checkpoints = device_folder(folder.checkpoints, processes.process_index)
-        self._saver = checkpoint.BackgroundSaver(self._checkpoints, config.checkpoint.keep)
+        self._saver = BackgroundSaver(self._checkpoints, config.checkpoint.keep, as_yaml(config))
         self._best_iteration = -1
+        self._restored_facts: Mapping[str, Any] = {}
         self._writer: MetricsWriter | None = None
         self._wandb: WandbLog | None = None
         self._filmer = Filmer(config, folder) if config.evaluation.films else None
@@ -57,7 +65,9 @@ class Recorder:
         Args:
             like: TrainState of shapes and dtypes.
         """
-        return restore_newest(self._folder.checkpoints, like, self._processes)
+        state, facts = restore_newest(self._folder.checkpoints, like, self._processes)
+        self._restored_facts = facts
+        return state, facts
 
     def begin(self, env_steps: int, will_train: bool) -> None:
         """Open the logs. Save the configuration of a resumed run.
@@ -68,24 +78,28 @@ class Recorder:
         """
         if not self._is_main_process:
             return
-        if self.config.resume:
-            save_config(self.config, self._folder.config)
-        self._writer = MetricsWriter(self._folder.path, env_steps if self.config.resume else None)
-        self._wandb = WandbLog(self.config, self._folder) if self.config.wandb_project else None
-        if will_train:
-            self._folder.gymnasium_scores.unlink(missing_ok=True)
+        with self._writing():
+            if self.config.resume:
+                save_config(self.config, self._folder.config)
+            resume_steps = env_steps if self.config.resume else None
+            self._writer = MetricsWriter(self._folder.path, resume_steps, self._restored_facts)
+            self._wandb = WandbLog(self.config, self._folder) if self.config.wandb_project else None
+            if will_train:
+                self._folder.gymnasium_scores.unlink(missing_ok=True)
 
     def write(self, row: Row) -> None:
         """Log a row."""
         if self._writer:
-            self._writer.write(row)
+            with self._writing():
+                self._writer.write(row)
         if self._wandb:
             self._wandb.write(row)
 
     def film(self, policy_params: Any, env_steps: int) -> None:
         """Film a policy, if the configuration asks for films."""
         if self._filmer and self._is_main_process:
-            self._filmer.take(policy_params, env_steps)
+            with self._writing():
+                self._filmer.take(policy_params, env_steps)
 
     def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:
         """Start to save the complete state, and first the final policy, and the best one if it is new.
@@ -93,15 +107,20 @@ class Recorder:
         A state with a replay buffer may take long to save.
         """
         facts = {"env_steps": env_steps, "wall_seconds": wall_seconds, NUM_DEVICES: self._processes.process_count}
-        parts: list[Any] = [(checkpoint.step_path(self._checkpoints, env_steps), state, facts)]
+        if self._writer:
+            facts |= self._writer.mark
+        parts = [Part(checkpoint.step_path(self._checkpoints, env_steps), state, facts)]
         if self._is_main_process:
             final = (self._algorithm.policy_params(state), {"env_steps": env_steps})
-            parts.insert(0, (self._folder.policy(FINAL), *final))
-            best = self._best_policy(state)
+            parts.insert(0, Part(self._folder.policy(FINAL), *final))
+            best = best_policy(state, self._steps_per_iteration)
             if best and int(state.evaluation.best_iteration) != self._best_iteration:
                 self._best_iteration = int(state.evaluation.best_iteration)
-                parts.insert(0, (self._folder.policy(BEST), *best))
-        self._saver.save(*parts)
+                parts.insert(0, Part(self._folder.policy(BEST), *best))
+        with self._writing():
+            if self._writer:
+                self._writer.sync()
+            self._saver.save(*parts)
 
     def end(self, state: TrainState, env_steps: int, evaluate: Callable[[Any], float] | None) -> None:
         """Close the logs, draw the curves, and keep the policies that are to be scored.
@@ -115,9 +134,7 @@ class Recorder:
         """
         if not self._writer:
             return
-        self._writer.close()
-        if self._wandb:
-            self._wandb.close()
+        self._close_logs()
         from mjx_walk.viewing.run_plots import plot_run  # imports Matplotlib, which slows the start
 
         try:
@@ -126,12 +143,13 @@ class Recorder:
             _log.warning(f"cannot draw the curves of {self._folder.path}: {error}; draw them with mjx_walk.plots")
         final: Any = self._algorithm.policy_params(state)
         facts: dict[str, Any] = {"env_steps": env_steps}
-        best = self._best_policy(state)
+        best = best_policy(state, self._steps_per_iteration)
         if evaluate:
             facts |= {"eval_return": evaluate(final)}
             if not best or facts["eval_return"] > best[1]["eval_return"]:
                 best = (final, facts)
-                self._saver.save((self._folder.policy(BEST), *best))
+                with self._writing():
+                    self._saver.save(Part(self._folder.policy(BEST), *best))
         self._policies = {FINAL: (final, facts)} | ({BEST: best} if best else {})
 
     def score(self, wall_seconds: float) -> dict[str, tuple[Scores, int]]:
@@ -155,20 +173,44 @@ class Recorder:
                 scores = score_in_gymnasium(self._task, deterministic_act(acting, params), num_episodes)
             scored[name] = (scores, facts["env_steps"])
             blocks[name] = scores.block(**facts)
-        write_scores(self._folder.gymnasium_scores, self._task.gymnasium_id, blocks, wall_seconds=wall_seconds)
+        with self._writing():
+            write_scores(self._folder.gymnasium_scores, self._task.gymnasium_id, blocks, wall_seconds=wall_seconds)
         return scored
 
     def wait(self) -> None:
         """Wait until all files are on disk."""
-        self._saver.wait()
+        with self._writing():
+            self._saver.wait()
         if self._filmer:
             self._filmer.wait()
 
-    def _best_policy(self, state: TrainState) -> tuple[Any, dict[str, Any]] | None:
-        """Policy with the highest inline evaluation, and its facts. None until the first evaluation ends."""
-        evaluation = state.evaluation
-        if math.isinf(evaluation.best_return):
-            return None
-        steps_per_iteration = self._algorithm.steps_per_iteration * self._processes.process_count
-        env_steps = int(evaluation.best_iteration) * steps_per_iteration
-        return evaluation.best_policy_params, {"env_steps": env_steps, "eval_return": float(evaluation.best_return)}
+    def close(self) -> None:
+        """Finish the checkpoint that is being written, and close the logs, however training has ended."""
+        try:
+            with self._writing():
+                self._saver.wait()
+        finally:
+            self._close_logs()
+
+    def _close_logs(self) -> None:
+        if self._writer:
+            self._writer.close()
+            self._writer = None
+        if self._wandb:
+            self._wandb.close()
+            self._wandb = None
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Context manager that reports a failed write in one line."""
+        try:
+            yield
+        except OSError as error:
+            folder = self._folder.path
+            if error.filename == str(folder) or not self._folder.checkpoints.is_dir():
+                raise UserError(f"{folder} has vanished, and with it what was saved; training has stopped") from error
+            reason = error.strerror or error
+            raise UserError(
+                f"cannot write {error.filename or folder}: {reason}; earlier checkpoints are complete; once it can be "
+                f"written, continue with run_dir={folder} resume=true"
+            ) from error

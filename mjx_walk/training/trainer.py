@@ -1,7 +1,7 @@
 """The host loop: call the compiled program, log, save, and score at the end."""
 
 import collections
-import dataclasses
+import contextlib
 import functools
 import logging
 import signal
@@ -13,9 +13,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_walk.algos import TrainState, learned_leaves, make_algorithm
+from mjx_walk.algos import TrainState, learned_leaves, make_algorithm, without_replay
 from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
+from mjx_walk.envs.vector_env import check_resets
 from mjx_walk.runs.checkpoint import list_steps
 from mjx_walk.runs.config import Config
 from mjx_walk.runs.loggers import Progress
@@ -28,7 +29,7 @@ from mjx_walk.training.recorder import Recorder
 from mjx_walk.training.summary import end_lines, score_lines
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.signals import Interrupt
+from mjx_walk.utils.signals import Interrupt, postponed
 from mjx_walk.utils.types import Metrics
 
 _log = logging.getLogger(__name__)
@@ -161,6 +162,12 @@ class Trainer:
         for line in end_lines(paths, seconds, self._seconds(), bool(num_episodes)) if is_main else ():
             _log.info(line)
 
+    def close(self) -> None:
+        """Finish the checkpoints that are being written, and close the logs, however training has ended."""
+        with postponed("finishing the checkpoint"), contextlib.ExitStack() as closing:
+            for recorder in self.recorders:
+                closing.callback(recorder.close)
+
     def _start(self) -> tuple[TrainState, int]:
         """Initial or restored TrainState, and the number of completed calls."""
         keys = [jax.random.PRNGKey(recorder.config.seed) for recorder in self.recorders]
@@ -168,7 +175,9 @@ class Trainer:
             for folder in self._folders:
                 if self.config.resume and folder.metrics.exists():
                     warnings.warn(f"{folder.path} has no checkpoint; training restarts from step 0", stacklevel=2)
-            return self._program.init(keys), 0
+            state = self._program.init(keys)
+            check_resets(state.env)
+            return state, 0
         like = jax.eval_shape(make_init(self._algorithm.init), keys[0])
         restored = [recorder.restore(like) for recorder in self.recorders]
         steps = {facts["env_steps"] for _, facts in restored}
@@ -180,7 +189,7 @@ class Trainer:
 
     def _end(self, state: TrainState, call: int, is_stopped: bool) -> None:
         """Close the run folders. A run that stops early waits for its saves here, since no scoring follows."""
-        state = _without_replay(state)
+        state = without_replay(state)
         for recorder, own in zip(self.recorders, self._program.split(state), strict=True):
             evaluate = functools.partial(self._mean_return, recorder.config.seed)
             recorder.end(own, call * self.steps_per_call, None if is_stopped else evaluate)
@@ -242,7 +251,7 @@ class Trainer:
     def _nonfinite(self, state: TrainState) -> str:
         """The first learned leaf that is not finite, and its seed, for each run that has one."""
         found = []
-        for recorder, own in zip(self.recorders, self._program.split(_without_replay(state)), strict=True):
+        for recorder, own in zip(self.recorders, self._program.split(without_replay(state)), strict=True):
             names = [name for name, leaf in learned_leaves(own).items() if not jnp.isfinite(leaf).all()]
             found += [f"{name} of seed {recorder.config.seed}" for name in names[:1]]
         return ", ".join(found)
@@ -252,12 +261,6 @@ class Trainer:
         number = signal.Signals[interrupt.signal_name].value if interrupt.signal_name else 0
         number = self._program.max_over_processes(number)
         return signal.Signals(number).name if number else None
-
-
-def _without_replay(state: TrainState) -> TrainState:
-    """State without its replay buffer, which is already saved."""
-    fields = {field.name: () for field in dataclasses.fields(state) if field.metadata.get("replay")}
-    return state.replace(**fields)
 
 
 def _mean_row(rows: list[Row]) -> Row:

@@ -62,7 +62,8 @@ class _Handler(logging.Handler):
         is_warning = record.levelno >= logging.WARNING
         text = f"{record.levelname.lower()}: {record.getMessage()}" if is_warning else record.getMessage()
         is_progress = record.name == "mjx_walk.progress"
-        print(text, file=sys.stderr if is_warning or is_progress else sys.stdout, flush=True)
+        with contextlib.suppress(OSError):  # a terminal that has closed does not end a training
+            print(text, file=sys.stderr if is_warning or is_progress else sys.stdout, flush=True)
 
 
 def _in_one_line(

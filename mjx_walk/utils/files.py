@@ -1,7 +1,9 @@
-"""Files that are written completely or not at all, and never through a link."""
+"""Files that are written completely or not at all, never through a link, and that survive a loss of power."""
 
 import contextlib
+import errno
 import os
+import re
 import secrets
 import unicodedata
 from collections.abc import Iterator
@@ -9,7 +11,19 @@ from pathlib import Path
 
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["check_replaceable", "fresh_name", "has_controls", "open_to_append", "replacing", "user_path", "write_text"]
+__all__ = [
+    "Appender",
+    "check_replaceable",
+    "fresh_name",
+    "has_controls",
+    "is_unfinished",
+    "open_to_append",
+    "replacing",
+    "sync",
+    "sync_tree",
+    "user_path",
+    "write_text",
+]
 
 _CONTROLS = ("Cc", "Cs", "Zl", "Zp")
 """Unicode's categories of control characters, lone surrogates, and separators of lines and paragraphs."""
@@ -45,6 +59,7 @@ def has_controls(text: str) -> bool:
 def replacing(path: Path, mode: int = 0o666) -> Iterator[Path]:
     """Context manager for writing a file under a fresh name in the same folder. On success it replaces `path`.
 
+    The content is on the disk before the name is, so that a loss of power leaves the old file or the new one.
     A symbolic or hard link at `path` is replaced; the file that it leads to stays unchanged. On an error, `path` stays
     as it is, and the new file is removed.
 
@@ -64,10 +79,34 @@ def replacing(path: Path, mode: int = 0o666) -> Iterator[Path]:
     os.close(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))
     try:
         yield new
+        sync(new)
         os.replace(new, path)
-    except BaseException:
+        sync(path.parent)
+    except BaseException as error:
         new.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (None, str(new)):
+            error.filename = str(path)  # for messages
         raise
+
+
+def sync(path: Path) -> None:
+    """Wait until a file's content, or a folder's list of names, is on the disk."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # file systems that cannot sync folders say so
+            raise OSError(error.errno, error.strerror, str(path)) from error
+    finally:
+        os.close(descriptor)
+
+
+def sync_tree(folder: Path) -> None:
+    """Wait until all files and folders below a folder, and the folder itself, are on the disk."""
+    for directory, _, files in os.walk(folder, topdown=False):
+        for name in files:
+            sync(Path(directory, name))
+        sync(Path(directory))
 
 
 def check_replaceable(path: Path) -> None:
@@ -87,6 +126,12 @@ def fresh_name(path: Path) -> Path:
     return path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
 
 
+def is_unfinished(path: Path) -> bool:
+    """Whether a path is a file under a fresh name, which a crash has left."""
+    is_fresh = re.fullmatch(r"\..+\.[0-9a-f]{16}(\.\w+)?", path.name)
+    return bool(is_fresh) and path.is_file() and not path.is_symlink()
+
+
 def write_text(path: Path, text: str, mode: int = 0o666) -> None:
     """Write a UTF-8 file as `replacing` does."""
     with replacing(path, mode) as new:
@@ -103,3 +148,43 @@ def open_to_append(path: Path) -> int:
         OSError: a symbolic link, or a file that cannot be written.
     """
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW, 0o666)
+
+
+class Appender:
+    """A file to which bytes are appended without a buffer, so that the end of this process loses none of them."""
+
+    def __init__(self, path: Path):
+        """
+        Args:
+            path: of the file, which is created if it does not exist. A symbolic link is refused.
+        """
+        self._path = path
+        self._descriptor = open_to_append(path)
+
+    def append(self, data: bytes) -> None:
+        """Append all bytes.
+
+        Raises:
+            OSError: with the path, for example because the disk is full. Some of the bytes may be written.
+        """
+        try:
+            while data:
+                data = data[os.write(self._descriptor, data) :]
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self._path)) from error
+
+    @property
+    def is_in_place(self) -> bool:
+        """Whether the path still leads to this file: it may have been removed, moved or replaced."""
+        try:
+            return os.path.samestat(os.stat(self._path), os.fstat(self._descriptor))
+        except OSError:
+            return False
+
+    def sync(self) -> None:
+        """Wait until the content is on the disk."""
+        os.fsync(self._descriptor)
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._descriptor)

@@ -6,14 +6,16 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 
-__all__ = ["Interrupt", "Stopped", "as_by_ctrl_c", "exit_code"]
+__all__ = ["Interrupt", "Stopped", "as_by_ctrl_c", "exit_code", "postponed"]
 
 _PROGRESS = logging.getLogger("mjx_walk.progress")
-_FROM_SCHEDULERS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR1") if hasattr(signal, name))
+_NAMES = ("SIGTERM", "SIGUSR1", "SIGHUP")
+_FROM_OUTSIDE = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
+"""Signals of schedulers, and of a terminal that closes."""
 
 
 class Interrupt:
-    """Context manager that records Ctrl-C, SIGTERM and SIGUSR1. A second Ctrl-C raises `KeyboardInterrupt`."""
+    """Context manager that records Ctrl-C, SIGTERM, SIGUSR1 and SIGHUP. A second Ctrl-C raises `KeyboardInterrupt`."""
 
     def __init__(self, doing: str = "finishing this call, then saving") -> None:
         """
@@ -22,7 +24,7 @@ class Interrupt:
         """
         self._doing = doing
         self.signal_name: str | None = None
-        self._handled = _handled_by(self._note, signal.SIGINT, *_FROM_SCHEDULERS)
+        self._handled = _handled_by(self._note, signal.SIGINT, *_FROM_OUTSIDE)
 
     def __enter__(self) -> "Interrupt":
         self._handled.__enter__()
@@ -39,7 +41,7 @@ class Interrupt:
 
 
 class Stopped(KeyboardInterrupt):
-    """Raised by SIGTERM and SIGUSR1 where Ctrl-C raises `KeyboardInterrupt`."""
+    """Raised by SIGTERM, SIGUSR1 and SIGHUP where Ctrl-C raises `KeyboardInterrupt`."""
 
     def __init__(self, signal_name: str):
         """
@@ -51,24 +53,48 @@ class Stopped(KeyboardInterrupt):
 
 
 def as_by_ctrl_c() -> contextlib.AbstractContextManager[None]:
-    """Context manager in which SIGTERM and SIGUSR1 raise `Stopped`, so that cleanup runs as after Ctrl-C."""
+    """Context manager in which the signals from outside raise `Stopped`, so that cleanup runs as after Ctrl-C."""
 
     def stop(number: int, _) -> None:
         raise Stopped(signal.Signals(number).name)
 
-    return _handled_by(stop, *_FROM_SCHEDULERS)
+    return _handled_by(stop, *_FROM_OUTSIDE)
+
+
+@contextlib.contextmanager
+def postponed(doing: str) -> Iterator[None]:
+    """Context manager in which signals wait: the first one takes effect when the block ends.
+
+    Args:
+        doing: what the process does until then, for the message.
+    """
+    received: list[int] = []
+
+    def note(number: int, _) -> None:
+        received.append(number)
+        _PROGRESS.info("\n%s: %s", signal.Signals(number).name, doing)
+
+    with _handled_by(note, signal.SIGINT, *_FROM_OUTSIDE):
+        yield
+    if received:
+        signal.raise_signal(received[0])
 
 
 @contextlib.contextmanager
 def _handled_by(handler: Callable, *numbers: signal.Signals) -> Iterator[None]:
     previous = {}
     if threading.current_thread() is threading.main_thread():  # Python allows handlers only there
-        previous = {number: signal.signal(number, handler) for number in numbers}
+        previous = {number: signal.signal(number, handler) for number in numbers if not _is_ignored_hangup(number)}
     try:
         yield
     finally:
         for number, before in previous.items():
             signal.signal(number, before)
+
+
+def _is_ignored_hangup(number: signal.Signals) -> bool:
+    """Whether `nohup` has asked to outlive the terminal."""
+    return number.name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN
 
 
 def exit_code(signal_name: str) -> int:

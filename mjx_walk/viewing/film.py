@@ -13,11 +13,12 @@ import jax
 import numpy as np
 
 from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import Config, save_config
+from mjx_walk.runs.config import Config
 from mjx_walk.runs.policies import SavedPolicy
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.saved_config import save_config
 from mjx_walk.runs.scores import FINAL
-from mjx_walk.runs.tensorboard import Summary, SummaryWriter
+from mjx_walk.runs.tensorboard import EventFile, Summary
 from mjx_walk.utils.subprocesses import start_module
 from mjx_walk.viewing.episode import record_episode
 from mjx_walk.viewing.rendering import write_film
@@ -80,8 +81,9 @@ def _add_to_tensorboard(run_dir: Path, env_steps: int, frames: np.ndarray, frame
     iio.imwrite(gif, frames, extension=".gif", duration=1000.0 / frames_per_second, loop=0)
     _, height, width, _ = frames.shape
     image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=gif.getvalue())
-    with SummaryWriter(str(run_dir), filename_suffix=f".film{env_steps}") as events:
-        events.file_writer.add_summary(Summary(value=[Summary.Value(tag="film", image=image)]), env_steps)
+    events = EventFile(run_dir)
+    events.add({"film": image}, env_steps)
+    events.close()
 
 
 if __name__ == "__main__":

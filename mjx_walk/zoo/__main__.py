@@ -9,7 +9,8 @@ import jax
 from mjx_walk import zoo
 from mjx_walk.api import load_run
 from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import save_config, training_command
+from mjx_walk.runs.config import training_command
+from mjx_walk.runs.saved_config import save_config
 from mjx_walk.runs.scores import BEST, write_scores
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError

@@ -12,7 +12,8 @@ from helpers import command, command_here, finish, start, wait_for_rows
 
 from mjx_walk import compare as compare_command
 from mjx_walk.experiments import logged_runs, planned_runs, suite
-from mjx_walk.runs.config import load_config, save_config
+from mjx_walk.runs.config import load_config
+from mjx_walk.runs.saved_config import save_config
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.text import format_score
 

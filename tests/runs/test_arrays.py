@@ -16,6 +16,7 @@ from helpers import CLONE, ENVIRONMENT
 
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.arrays import read_arrays, write_arrays
+from mjx_walk.runs.facts import read_facts, write_facts
 from mjx_walk.utils.errors import UserError
 
 EXPECTED = {
@@ -199,8 +200,7 @@ def test_a_small_file_that_unpacks_to_much_takes_no_memory(tmp_path, kind):
 def saved(tmp_path, **facts):
     path = checkpoint.step_path(tmp_path, 10)
     checkpoint.save(path, {"a": EXPECTED["a"]}, {"env_steps": 10, "wall_seconds": 1.0})
-    text = json.loads((path / "meta.json").read_text()) | facts
-    (path / "meta.json").write_text(json.dumps(text))
+    write_facts(path / "meta.json", read_facts(path / "meta.json") | facts)
     return path
 
 
@@ -221,7 +221,7 @@ def test_a_fact_of_another_type_is_named(tmp_path, name, value, valid):
     with pytest.raises(ValueError, match=f"{name} should be {valid}.*, found ") as error:
         checkpoint.restore(path, {"a": EXPECTED["a"]})
     assert str(path / "meta.json") in str(error.value) and str(error.value).isprintable()
-    with pytest.warns(UserWarning, match="falling back"), pytest.raises(UserError, match="no usable checkpoint"):
+    with pytest.warns(UserWarning, match=f"{name} should be"), pytest.raises(UserError, match="no usable checkpoint"):
         checkpoint.restore_newest(tmp_path, {"a": EXPECTED["a"]})
 
 

@@ -46,7 +46,7 @@ def test_an_interrupted_save_leaves_the_last_one_alone(tmp_path, monkeypatch):
     def crash(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(checkpoint.os, "replace", crash)
+    monkeypatch.setattr("mjx_walk.utils.folders.os.replace", crash)
     with pytest.raises(KeyboardInterrupt):
         checkpoint.save(checkpoint.step_path(tmp_path, 20), TREE, {"env_steps": 20})
     assert checkpoint.list_steps(tmp_path) == [path]

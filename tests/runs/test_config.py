@@ -14,15 +14,8 @@ from mjx_walk.algos import ALGORITHMS, make_algorithm
 from mjx_walk.api import make_task, resolve
 from mjx_walk.envs import TASKS
 from mjx_walk.experiments import planned_runs
-from mjx_walk.runs.config import (
-    CONFIG_DIR,
-    flatten,
-    load_config,
-    read_config,
-    recipe_names,
-    save_config,
-    training_command,
-)
+from mjx_walk.runs.config import CONFIG_DIR, flatten, load_config, recipe_names, training_command
+from mjx_walk.runs.saved_config import read_config, save_config
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.settings import describe, has_effect
 

@@ -8,7 +8,8 @@ from helpers import TINY, TINY_CALL, command_here, train_here, unregistered
 import mjx_walk
 from mjx_walk.envs import TASKS, registry
 from mjx_walk.envs.walker2d import Walker2d
-from mjx_walk.runs.config import load_config, read_config, save_config
+from mjx_walk.runs.config import load_config
+from mjx_walk.runs.saved_config import read_config, save_config
 from mjx_walk.utils.errors import UserError
 
 TASK = """

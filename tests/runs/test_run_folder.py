@@ -10,7 +10,9 @@ from helpers import OLD_RUNS, command_here, train_here
 
 from mjx_walk import api
 from mjx_walk.runs import checkpoint
-from mjx_walk.runs.run_folder import in_short, open_existing
+from mjx_walk.runs.background_saver import BackgroundSaver, Part
+from mjx_walk.runs.run_folder import open_existing
+from mjx_walk.runs.saved_config import in_short
 from mjx_walk.utils.errors import UserError
 
 
@@ -117,11 +119,11 @@ def test_later_checkpoints_do_not_crowd_out_new_ones(tmp_path):
     tree = {"a": 1.0}
     for steps in (10, 70, 80, 90):
         checkpoint.save(checkpoint.step_path(tmp_path, steps), tree, {"env_steps": steps})
-    saver = checkpoint.BackgroundSaver(tmp_path, keep=2)
-    saver.save((checkpoint.step_path(tmp_path, 20), tree, {"env_steps": 20}))
+    saver = BackgroundSaver(tmp_path, keep=2)
+    saver.save(Part(checkpoint.step_path(tmp_path, 20), tree, {"env_steps": 20}))
     saver.wait()
     assert [int(path.name) for path in checkpoint.list_steps(tmp_path)] == [10, 20]
-    saver.save((tmp_path / "best", tree, {"env_steps": 5}))
+    saver.save(Part(tmp_path / "best", tree, {"env_steps": 5}))
     saver.wait()
     assert [int(path.name) for path in checkpoint.list_steps(tmp_path)] == [10, 20]
 

@@ -5,14 +5,14 @@ import shutil
 
 import gymnasium
 import pytest
-from helpers import TINY, TINY_CALL, command_here, train_here
+from helpers import TINY, TINY_CALL, command_here, edit_config, train_here
 
 from mjx_walk import api
 from mjx_walk import train as train_command
 from mjx_walk.envs import make_env
 from mjx_walk.runs import trust
-from mjx_walk.runs.config import read_config, save_config
 from mjx_walk.runs.policies import make_task
+from mjx_walk.runs.saved_config import read_config, save_config
 from mjx_walk.utils.errors import UserError
 
 MODEL = f"{gymnasium.__path__[0]}/envs/mujoco/assets/walker2d_v5.xml"
@@ -90,8 +90,7 @@ def test_a_run_folder_with_its_own_file_and_hash_stays_a_strangers(home, capsys)
     own = run_dir / "mjx_walk" / "trusted_reward_functions.json"
     own.parent.mkdir()
     own.write_text(json.dumps({source: hashes}))
-    text = (run_dir / "config.yaml").read_text()
-    (run_dir / "config.yaml").write_text(text.replace("reward_function: null", f"reward_function: {source}"))
+    edit_config(run_dir, "reward_function: null", f"reward_function: {source}")
     capsys.readouterr()
     line = refused(capsys, f"run_dir={run_dir}", "resume=true")
     assert line == f"error: the saved run uses the code of {source}; to run it, add env.reward_function={source}"
@@ -99,8 +98,7 @@ def test_a_run_folder_with_its_own_file_and_hash_stays_a_strangers(home, capsys)
 
 
 def test_another_function_of_a_trusted_file_is_not_trusted(trained):
-    config = trained / "work" / "run" / "config.yaml"
-    config.write_text(config.read_text().replace("r.py:reward", "r.py:another"))
+    edit_config(trained / "work" / "run", "r.py:reward", "r.py:another")
     with pytest.raises(UserError, match="to run it, add env"):
         api.resolve(["run_dir=run", "resume=true"])
 

@@ -9,7 +9,8 @@ from helpers import TINY, TINY_CALL, command
 from wandb.proto.wandb_internal_pb2 import Record
 
 import mjx_walk.api
-from mjx_walk.runs.config import load_config, save_config
+from mjx_walk.runs.config import load_config
+from mjx_walk.runs.saved_config import save_config
 from mjx_walk.utils.errors import UserError
 
 

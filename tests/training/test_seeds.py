@@ -7,7 +7,8 @@ import pytest
 from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, leaves, train, train_here
 
 from mjx_walk import train as train_command
-from mjx_walk.runs.config import load_config, save_config
+from mjx_walk.runs.config import load_config
+from mjx_walk.runs.saved_config import save_config
 from mjx_walk.utils.errors import UserError
 
 SEEDS = "seeds=[3,5]"

@@ -9,7 +9,8 @@ from helpers import command, command_here
 
 import mjx_walk
 from mjx_walk import zoo
-from mjx_walk.runs.config import flatten, load_config, read_config, training_command
+from mjx_walk.runs.config import flatten, load_config, training_command
+from mjx_walk.runs.saved_config import read_config
 from mjx_walk.runs.scores import read_scores
 from mjx_walk.utils.settings import has_effect
 

@@ -1,0 +1,57 @@
+"""Saves checkpoints in a thread, so that training continues."""
+
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mjx_walk.runs import checkpoint
+
+__all__ = ["BackgroundSaver", "Part"]
+
+
+class Part(NamedTuple):
+    """Arguments of `checkpoint.save` for one folder."""
+
+    path: Path
+    tree: Any
+    facts: dict[str, Any]
+
+
+class BackgroundSaver:
+    """Writes checkpoints in the background, one at a time. Training waits only for the copy to the host."""
+
+    def __init__(self, folder: Path, keep: int, config: str | None = None):
+        """
+        Args:
+            folder: folder of the checkpoints.
+            keep: number of newest checkpoints to keep.
+            config: text of the configuration, of which each checkpoint holds a copy.
+        """
+        self._folder = folder
+        self._keep = keep
+        self._config = config
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
+        self._running: Future[None] | None = None
+
+    def save(self, *parts: Part) -> None:
+        """Copy pytrees to the host and start to write them in order. Waits for the previous save first."""
+        self.wait()
+        copied = [part._replace(tree=checkpoint.to_host(part.tree)) for part in parts]
+        self._running = self._executor.submit(self._save, copied)
+
+    def wait(self) -> None:
+        """Wait until the current save is complete.
+
+        Raises:
+            OSError: writing failed, for example because the disk is full.
+        """
+        running, self._running = self._running, None
+        if running:
+            running.result()
+
+    def _save(self, parts: Iterable[Part]) -> None:
+        steps = [part.path.name for part in parts if part.path.name.isdigit()]
+        for part in parts:
+            checkpoint.save(*part, config=self._config)
+        checkpoint.prune(self._folder, self._keep, max(steps, default=None))

@@ -1,0 +1,80 @@
+"""Folders that are written completely or not at all, and found again if a crash came between two renames."""
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from mjx_walk.utils.files import fresh_name, sync, sync_tree
+
+__all__ = ["discard", "find_written", "remove_unfinished", "replacing_folder"]
+
+_UNFINISHED = ".unfinished"
+"""Suffix of folders that are being written, replaced or removed."""
+
+
+@contextlib.contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """Context manager for writing a folder under a fresh name. On success it replaces `path`, else it is removed.
+
+    All its files are on the disk before the name is. The folder above `path` is created, but none above that.
+    """
+    path.parent.mkdir(exist_ok=True)
+    unfinished, former = _hidden_name(path), _hidden_name(path)
+    unfinished.mkdir()
+    try:
+        yield unfinished
+        sync_tree(unfinished)
+        if path.exists():
+            os.replace(path, former)  # atomic, unlike removing a folder
+        os.replace(unfinished, path)
+        sync(path.parent)
+    except BaseException:
+        if former.exists():
+            os.replace(former, path)
+        raise
+    finally:
+        _remove(former)
+        _remove(unfinished)
+
+
+def find_written(path: Path, last_file: str) -> Path | None:
+    """The folder at `path`; or, if a crash came before its last rename, the one that was to be there, or was before.
+
+    Args:
+        path: as given to `replacing_folder`.
+        last_file: name of the file that is written last.
+    """
+    if path.is_dir():
+        return path
+    hidden = [folder / last_file for folder in path.parent.glob(f".{path.name}.*{_UNFINISHED}")]
+    written = [file for file in hidden if file.is_file()]
+    return max(written, key=lambda file: file.stat().st_mtime_ns).parent if written else None
+
+
+def discard(path: Path) -> None:
+    """Remove a folder. A crash leaves it complete, or without its name."""
+    hidden = _hidden_name(path)
+    os.replace(path, hidden)
+    _remove(hidden)
+
+
+def remove_unfinished(folder: Path, last_file: str) -> None:
+    """Remove what crashes have left in a folder, except what `find_written` finds."""
+    for path in folder.glob(f".*{_UNFINISHED}"):
+        name = path.name[1:].removesuffix(_UNFINISHED).rpartition(".")[0]
+        if find_written(folder / name, last_file) != path:
+            _remove(path)
+
+
+def _hidden_name(path: Path) -> Path:
+    return fresh_name(path.with_name(path.name + _UNFINISHED))
+
+
+def _remove(path: Path) -> None:
+    """Remove a folder, or a file that stands in its place, if there is one."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
