@@ -1,6 +1,7 @@
 """Models from elsewhere: each equals Gymnasium's class under the same file, or is refused in one line."""
 
 import importlib.util
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import gymnasium
@@ -127,3 +128,46 @@ def test_shaping_needs_the_coordinate_in_the_model(shaping, says):
 
 def test_the_view_fits_the_model():
     assert all(make_env(name, physics="c").view == TASKS[name][0].VIEW for name in TASKS)
+
+
+@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("inside", ["", "<worldbody/>", "<worldbody><geom size='1'/><site name='s'/></worldbody>"])
+def test_a_model_without_bodies_is_refused(tmp_path, name, inside):
+    (tmp_path / "empty.xml").write_text(f"<mujoco>{inside}</mujoco>")
+    with pytest.raises(UserError, match=r"(the model has no body|needs a model with)"):
+        make_env(name, physics="c", xml_file=str(tmp_path / "empty.xml"))
+
+
+ABSURD = [
+    ('timestep="0.002"', 'timestep="0.002" gravity="0 0 -1e300"', "qacc"),
+    ('ref="1.25"', 'ref="1e300"', "qpos"),
+    ('ref="1.25" stiffness="0"', 'ref="1e10" springref="0" stiffness="1e300"', "qacc"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "name"), ABSURD)
+def test_a_model_that_overflows_in_its_own_pose_is_refused(tmp_path, old, new, name):
+    text = path_of("Gymnasium walker2d_v5.xml").read_text()
+    assert old in text
+    (tmp_path / "absurd.xml").write_text(text.replace(old, new))
+    with pytest.raises(UserError, match=f"the model cannot be simulated: {name} is not finite in its own pose"):
+        make_env("walker2d", physics="c", xml_file=str(tmp_path / "absurd.xml"))
+
+
+def test_threads_step_one_task_in_turn():
+    """MuJoCo's work space is shared: two threads in it at once would end the process."""
+    task = make_env("walker2d", physics="c")
+    state = [np.tile(np.asarray(x), (4, 1)) for x in (task.init_qpos, task.init_qvel, task.init_qvel)]
+    alone = task.engine._host_step(*state, np.zeros((4, 6)))
+    turns, step_one = [], task.engine._step_one
+
+    def counted(*arguments):
+        turns.append(task.engine._lock.locked())
+        step_one(*arguments)
+
+    task.engine._step_one = counted
+    with ThreadPoolExecutor(3) as threads:
+        together = list(threads.map(lambda _: task.engine._host_step(*state, np.zeros((4, 6))), range(30)))
+    assert len(turns) == 120 and all(turns)
+    for (qpos, *_), _, _ in together:
+        np.testing.assert_array_equal(qpos, alone[0][0])

@@ -1,6 +1,8 @@
 """Saved and restored TrainStates: exact, atomic, checked."""
 
+import errno
 import json
+import shutil
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,8 @@ import pytest
 from helpers import flip_a_byte
 
 from mjx_walk.runs import checkpoint
+from mjx_walk.runs.arrays import _as_os_error
+from mjx_walk.runs.facts import read_facts, write_facts
 from mjx_walk.utils.errors import UserError
 
 TREE = {
@@ -69,3 +73,77 @@ def test_another_shape_or_version_is_named(tmp_path):
     (tmp_path / "x" / "meta.json").write_text(json.dumps(meta | {"format": 99, "mjx_walk": "9.9"}))
     with pytest.raises(UserError, match=r"has checkpoint format 99, written by mjx_walk 9\.9"):
         checkpoint.restore(tmp_path / "x", TREE)
+
+
+def refused_or_equal(path):
+    """Whether a checkpoint is refused, or gives what was saved."""
+    try:
+        tree, meta = checkpoint.restore(path, TREE)
+    except ValueError:
+        return True
+    expected = {"env_steps": 10, "wall_seconds": 2.5, "num_devices": 1}
+    return {name: meta.get(name) for name in expected} == expected and np.array_equal(tree["a"], TREE["a"])
+
+
+def test_no_changed_character_of_the_facts_goes_unnoticed(tmp_path):
+    path, facts = checkpoint.step_path(tmp_path, 10), {"env_steps": 10, "wall_seconds": 2.5, "num_devices": 1}
+    checkpoint.save(path, TREE, facts, as_numpy=True)
+    meta = path / "meta.json"
+    text = meta.read_text()
+    for i, character in enumerate(text):
+        other = str((int(character) + 1) % 10) if character.isdigit() else "x"
+        meta.write_text(text[:i] + other + text[i + 1 :])
+        assert refused_or_equal(path), (i, character)
+    meta.write_text(text.replace('"env_steps": 10', '"env_steps": 70'))
+    with pytest.raises(ValueError, match=r"is damaged: meta\.json does not match its checksum"):
+        checkpoint.restore(path, TREE)
+
+
+@pytest.mark.parametrize("steps", [10, 11])
+def test_facts_of_an_earlier_version_are_those_of_their_own_step(tmp_path, steps):
+    """They have no checksum."""
+    path = checkpoint.step_path(tmp_path, 10)
+    checkpoint.save(path, TREE, {"env_steps": 10}, as_numpy=True)
+    meta = json.loads((path / "meta.json").read_text())
+    del meta["checksum"]
+    (path / "meta.json").write_text(json.dumps(meta | {"env_steps": steps}))
+    if steps == 10:
+        assert checkpoint.restore_newest(tmp_path, TREE)[1]["env_steps"] == 10
+        return
+    with pytest.warns(UserWarning, match="its facts are of step 11"), pytest.raises(UserError):
+        checkpoint.restore_newest(tmp_path, TREE)
+
+
+@pytest.mark.parametrize("damage", ["format", "shape", "configuration", "no configuration", "no facts", "no arrays"])
+def test_whatever_is_wrong_with_a_checkpoint_the_one_before_is_used(tmp_path, damage):
+    for steps in (10, 20):
+        tree = TREE | {"a": jnp.zeros(9)} if (damage, steps) == ("shape", 20) else TREE
+        checkpoint.save(checkpoint.step_path(tmp_path, steps), tree, {"env_steps": steps}, True, "seed: 0")
+    newest = checkpoint.step_path(tmp_path, 20)
+    if damage == "format":
+        write_facts(newest / "meta.json", read_facts(newest / "meta.json") | {"format": 9})
+    elif damage == "configuration":
+        (newest / "run_config.yaml").write_text("seed: 1")
+    elif damage in ("no configuration", "no facts"):
+        (newest / {"no configuration": "run_config.yaml", "no facts": "meta.json"}[damage]).unlink()
+    elif damage == "no arrays":
+        shutil.rmtree(newest / "arrays")
+    with pytest.warns(UserWarning, match=f"{newest}.*; falling back to the previous checkpoint"):
+        assert checkpoint.restore_newest(tmp_path, TREE)[1]["env_steps"] == 10
+
+
+def test_a_full_disk_is_an_error_about_the_disk(tmp_path, monkeypatch):
+    checkpoint.save(tmp_path / "best", TREE, {"env_steps": 1})
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr("mjx_walk.runs.arrays.shutil.disk_usage", lambda path: usage._replace(free=10))
+    with pytest.raises(OSError, match="No space left on device") as error:
+        checkpoint.save(tmp_path / "best", TREE, {"env_steps": 2})
+    assert error.value.errno == errno.ENOSPC
+    assert [path.name for path in tmp_path.iterdir()] == ["best"]
+    assert checkpoint.read_meta(tmp_path / "best")["env_steps"] == 1
+
+
+def test_an_error_of_the_disk_inside_tensorstore_is_one_too(tmp_path):
+    with pytest.raises(OSError, match="Input/output error") as error, _as_os_error(tmp_path):
+        raise ValueError("INTERNAL: Failed to write 5 bytes to file 14: Input/output error [os_error_code='5']")
+    assert (error.value.errno, error.value.filename) == (errno.EIO, str(tmp_path))

@@ -50,6 +50,66 @@ def test_many_damaged_lines_cost_one_warning(tmp_path):
     assert len(warned) == 1
 
 
+@pytest.fixture
+def logged(tmp_path):
+    """A log of four rows, and the mark that a checkpoint stores with it."""
+    writer = MetricsWriter(tmp_path)
+    for step in (1, 2, 3, 4):
+        writer.write({"env_steps": step, "wall_seconds": 0.1 + step, "train/loss": float("nan")})
+    writer.close()
+    return tmp_path / "metrics.jsonl", writer.mark
+
+
+def test_an_intact_log_resumes_in_silence(logged, recwarn):
+    path, mark = logged
+    before = path.read_bytes()
+    with path.open("a") as file:
+        file.write(line(5) + '{"env')  # after the checkpoint
+    writer = MetricsWriter(path.parent, 4, mark)
+    assert writer.mark == mark and path.read_bytes() == before and not recwarn
+    writer.close()
+
+
+@pytest.mark.parametrize("kept", [[0, 1, 2], [0, 2, 3], [1, 2], []])
+def test_lost_rows_are_noticed(logged, kept):
+    path, mark = logged
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[i] for i in kept))
+    with pytest.warns(UserWarning, match=rf"metrics\.jsonl has lost {4 - len(kept)} of 4 rows up to step 4"):
+        MetricsWriter(path.parent, 4, mark).close()
+
+
+def test_a_changed_row_is_noticed(logged):
+    path, mark = logged
+    path.write_text(path.read_text().replace("2.1", "2.2"))
+    with pytest.warns(UserWarning, match=r"metrics\.jsonl was changed after the run wrote it, up to step 4"):
+        MetricsWriter(path.parent, 4, mark).close()
+
+
+@pytest.mark.parametrize("is_replaced", [False, True])
+def test_a_log_that_is_removed_during_training_is_begun_again(tmp_path, is_replaced):
+    writer, path = MetricsWriter(tmp_path), tmp_path / "metrics.jsonl"
+    writer.write({"env_steps": 1, "wall_seconds": 1.0})
+    path.unlink()
+    if is_replaced:
+        path.write_text(line(1))
+    with pytest.warns(UserWarning, match="was removed or replaced; its rows before step 2 are gone"):
+        writer.write({"env_steps": 2, "wall_seconds": 2.0})
+    writer.close()
+    assert [row["env_steps"] for row in read_rows(path)] == ([1, 2] if is_replaced else [2])
+
+
+def test_no_row_is_written_into_another_folder(tmp_path):
+    (tmp_path / "run").mkdir()
+    writer = MetricsWriter(tmp_path / "run")
+    (tmp_path / "run").rename(tmp_path / "moved")
+    (tmp_path / "run").mkdir()
+    with pytest.raises(FileNotFoundError, match="run"):
+        writer.write({"env_steps": 2, "wall_seconds": 2.0})
+    writer.close()
+    assert list((tmp_path / "run").iterdir()) == []
+
+
 def test_a_log_is_never_written_through_a_link(tmp_path):
     """Neither one that was there, nor one that is put in place between the check and the first row."""
     (tmp_path / "precious").write_text("mine")

@@ -6,8 +6,8 @@ import pytest
 
 from mjx_walk.experiments import planned_runs
 from mjx_walk.runs.config import load_config
-from mjx_walk.runs.saved_config import read_config, save_config
 from mjx_walk.runs.overrides import complete_overrides
+from mjx_walk.runs.saved_config import read_config, save_config
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import user_path
 

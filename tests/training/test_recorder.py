@@ -1,5 +1,7 @@
 """Which policies a run keeps and scores."""
 
+import shutil
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,8 +10,8 @@ import pytest
 from mjx_walk.algos import make_algorithm
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import load_config
-from mjx_walk.runs.policies import choose_policy, load_policy, make_task
-from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.runs.policies import SavedPolicy, choose_policy, load_policy, make_task
+from mjx_walk.runs.run_folder import RunFolder, open_existing
 from mjx_walk.runs.scores import Scores, read_scores
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.recorder import Recorder
@@ -155,3 +157,64 @@ def test_the_next_save_of_a_resumed_run_keeps_what_its_state_holds_as_the_best(r
     params, facts = kept(folder, "best", algorithm, state)
     assert_same(params, best)
     assert facts == {"env_steps": 20, "eval_return": 10.0}
+
+
+ROW = {"env_steps": 4, "wall_seconds": 1.0}
+
+
+def test_a_folder_that_vanishes_stops_the_run_and_is_not_made_again(run):
+    recorder, _, state, folder = run
+    recorder.begin(0, will_train=True)
+    recorder.write(ROW)
+    shutil.rmtree(folder.path)
+    says = f"{folder.path} has vanished, and with it what was saved"
+    with pytest.raises(UserError, match=says):
+        recorder.write(ROW)
+    with pytest.raises(UserError, match=says):
+        recorder.save(state, env_steps=4, wall_seconds=1.0)
+    recorder.close()
+    assert not folder.path.exists()
+
+
+def test_a_full_disk_costs_one_line_and_no_checkpoint(run, monkeypatch):
+    recorder, algorithm, state, folder = run
+    recorder.save(state, env_steps=4, wall_seconds=1.0)
+    recorder.wait()
+    usage = shutil.disk_usage(folder.path)
+    monkeypatch.setattr("mjx_walk.runs.arrays.shutil.disk_usage", lambda path: usage._replace(free=10))
+    recorder.save(state, env_steps=8, wall_seconds=2.0)
+    says = rf"cannot write .*: No space left on device; .* continue with run_dir={folder.path} resume=true"
+    with pytest.raises(UserError, match=says):
+        recorder.save(state, env_steps=12, wall_seconds=2.0)
+    recorder.close()
+    assert [int(path.name) for path in checkpoint.list_steps(folder.checkpoints)] == [4]
+    assert kept(folder, "final", algorithm, state)[1]["env_steps"] == 4
+
+
+def test_a_policy_that_is_missing_or_damaged_is_in_the_checkpoint(run):
+    recorder, algorithm, state, folder = run
+    state, best = with_best(algorithm, state, best_return=3.0, best_iteration=5)
+    recorder.save(state, env_steps=80, wall_seconds=2.0)
+    recorder.wait()
+    (folder.policy("best") / "meta.json").write_text("{")
+    shutil.rmtree(folder.policy("final"))
+    for name, params, facts in (
+        ("best", best, {"env_steps": 20, "eval_return": 3.0}),
+        ("final", algorithm.policy_params(state), {"env_steps": 80}),
+    ):
+        with pytest.warns(UserWarning, match=rf"{name}.* is .*; the policy of the checkpoint at step 80 is used"):
+            loaded = SavedPolicy(folder, policy=name)
+        assert_same(loaded.policy_params, params)
+        assert loaded.policy_facts == facts
+
+
+def test_a_checkpoint_alone_can_be_scored(run, tmp_path):
+    recorder, algorithm, state, folder = run
+    recorder.save(state, env_steps=80, wall_seconds=2.0)
+    recorder.wait()
+    (path,) = checkpoint.list_steps(folder.checkpoints)
+    alone = tmp_path / "alone"
+    shutil.copytree(path, alone / "checkpoints" / path.name)
+    with pytest.warns(UserWarning, match="the policy of the checkpoint at step 80 is used"):
+        loaded = SavedPolicy(open_existing(alone))
+    assert_same(loaded.policy_params, algorithm.policy_params(state))

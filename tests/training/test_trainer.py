@@ -1,5 +1,8 @@
 """The loop: what it reports and saves, when, and how it ends."""
 
+import dataclasses
+import threading
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +12,10 @@ from helpers import TINY, TINY_CALL
 import mjx_walk
 from mjx_walk import train as train_command
 from mjx_walk.algos import make_algorithm
+from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import load_config
 from mjx_walk.runs.policies import make_task
+from mjx_walk.runs.preparation import prepared
 from mjx_walk.training import programs
 from mjx_walk.training.programs import make_init, make_step
 from mjx_walk.utils.errors import UserError
@@ -108,3 +113,29 @@ def test_only_seeds_whose_networks_are_finite_are_saved(tmp_path, monkeypatch):
         train_command.main([*TINY, f"run_dir={tmp_path}", "seeds=[3,5]", f"total_steps={50 * TINY_CALL}"])
     assert len(list((tmp_path / "seed_3" / "checkpoints").glob("0*"))) == 1
     assert not list((tmp_path / "seed_5" / "checkpoints").iterdir())
+
+
+def test_an_error_in_the_loop_finishes_the_checkpoint_that_is_being_written(tmp_path, monkeypatch):
+    has_failed, save = threading.Event(), checkpoint.save
+
+    def save_later(*arguments, **options):
+        assert has_failed.wait(60)
+        save(*arguments, **options)
+
+    def fail(row):
+        if row["env_steps"] > TINY_CALL:
+            has_failed.set()
+            raise RuntimeError("a user's")
+
+    monkeypatch.setattr(checkpoint, "save", save_later)
+    settings = [*TINY, f"run_dir={tmp_path}", "checkpoint.every_calls=1"]
+    with pytest.raises(RuntimeError, match="a user's"):
+        mjx_walk.run(settings, on_metrics=fail)
+    assert [int(path.name) for path in checkpoint.list_steps(tmp_path / "checkpoints")] == [TINY_CALL]
+    with prepared([dataclasses.replace(load_config([*settings, "resume=true"]), physics="c")]):
+        pass  # the lock is free
+
+
+def test_resets_that_are_not_finite_reach_no_network(tmp_path):
+    with pytest.raises(UserError, match=r"16 of 16 resets are not finite, or exceed 1e\+10; lower env.reset_noise"):
+        train_command.main([*TINY, f"run_dir={tmp_path}/run", "env.reset_noise_scale=3e38"])
