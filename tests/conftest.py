@@ -29,3 +29,8 @@ if _QUICK_COMPILE not in _FLAGS:  # pytest-xdist's workers inherit the flags
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _temporary_folder()
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--faults", type=int, default=200, help="kills, and damages, of `-m campaign`")
+    parser.addoption("--fault-seed", default="0", help="seed of the random faults")

@@ -175,6 +175,7 @@ def restore_newest(
     like: Any,
     part: Callable[[Path], Path] = lambda path: path,
     agree: Callable[[bool], bool] = lambda is_complete: is_complete,
+    at_most: int | None = None,
 ) -> tuple[Any, dict[str, Any]]:
     """Restore the newest complete checkpoint. Skips those that cannot be read, with a warning.
 
@@ -183,12 +184,14 @@ def restore_newest(
         like: as for `restore`.
         part: maps a checkpoint's path to the path to read. Raises ValueError if the checkpoint is damaged.
         agree: maps whether the part is complete to whether to use the checkpoint. Called once per checkpoint.
+        at_most: environment steps that the checkpoint may have at most.
 
     Raises:
         UserError: there is no usable checkpoint, or the newest belongs to another run and no other one is usable.
     """
     problems: list[ValueError] = []
-    for path in reversed(list_steps(folder)):
+    paths = [path for path in list_steps(folder) if at_most is None or int(path.name) <= at_most]
+    for path in reversed(paths):
         found = None
         try:
             found = restore(part(path), like)

@@ -72,6 +72,7 @@ _FACTS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "wall_seconds": (lambda value: _is_finite(value) and value >= 0, "a number from 0"),
     "num_devices": (lambda value: _is_count(value, 1) and value <= 10**6, "a whole number from 1 to 1,000,000"),
     "eval_return": (_is_finite, "a finite number"),
+    "seeds_together": (lambda value: _is_count(value, 1), "a whole number from 1"),
     "log_rows": (_is_count, "a whole number from 0"),
     "log_crc32": (_is_count, "a whole number from 0"),
     "config_crc32": (_is_count, "a whole number from 0"),

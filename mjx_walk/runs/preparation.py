@@ -57,9 +57,6 @@ def _check_all(folders: list[RunFolder], configs: list[Config]) -> None:
         differing = differences(configs[0], config, besides=("run_dir", "resume", "seed"))
         if differing:
             raise UserError(f"{folder.path} and {folders[0].path} differ in {in_short(differing)}; resume each alone")
-    steps = {_newest(folder) for folder in folders}
-    if len(steps) > 1:
-        raise UserError(f"the seeds are at different steps ({', '.join(sorted(steps))}); resume each alone")
 
 
 @contextlib.contextmanager
@@ -131,9 +128,3 @@ def _is_left_over(folder: RunFolder, path: Path) -> bool:
         return path.is_dir() and not any(path.iterdir())
     is_empty = path.is_file() and path.stat().st_size == 0
     return is_unfinished(path) or (is_empty and path in (folder.config, folder.lock))
-
-
-def _newest(folder: RunFolder) -> str:
-    """The environment steps of the newest checkpoint."""
-    saved = list_steps(folder.checkpoints)
-    return f"{int(saved[-1].name):,}" if saved else "0"

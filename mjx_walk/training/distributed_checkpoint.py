@@ -13,6 +13,8 @@ from mjx_walk.utils.types import map_marked
 
 NUM_DEVICES = "num_devices"
 """Key of a checkpoint's facts: the number of devices that saved it."""
+SEEDS_TOGETHER = "seeds_together"
+"""Key of a checkpoint's facts: the number of runs that trained in one program."""
 
 
 def device_folder(checkpoints: Path, process_index: int) -> Path:
@@ -20,11 +22,19 @@ def device_folder(checkpoints: Path, process_index: int) -> Path:
     return checkpoints / f"device_{process_index}" if process_index else checkpoints
 
 
-def restore_newest(checkpoints: Path, like: TrainState, processes: Processes) -> tuple[TrainState, dict[str, Any]]:
+def restore_newest(
+    checkpoints: Path, like: TrainState, processes: Processes, at_most: int | None = None
+) -> tuple[TrainState, dict[str, Any]]:
     """The newest checkpoint that is complete on all devices, for as many devices as there are now.
 
     A device that joins starts with a copy of another one's part, under random keys of its own. The parts of devices
     that left stay unused.
+
+    Args:
+        checkpoints: folder of the run's checkpoints.
+        like: TrainState of shapes and dtypes.
+        processes: processes of the run.
+        at_most: environment steps that the checkpoint may have at most.
 
     Raises:
         UserError: there is none, or it belongs to another run.
@@ -41,7 +51,7 @@ def restore_newest(checkpoints: Path, like: TrainState, processes: Processes) ->
     def agree(is_complete: bool) -> bool:
         return all(processes.all_gather(is_complete))
 
-    state, facts = checkpoint.restore_newest(checkpoints, like, part, agree)
+    state, facts = checkpoint.restore_newest(checkpoints, like, part, agree, at_most)
     former_count = facts.get(NUM_DEVICES, 1)
     if index >= former_count:
         state = map_marked(lambda key: jax.random.fold_in(key, index), "random_key", state)

@@ -18,7 +18,7 @@ from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.saved_config import as_yaml, save_config
 from mjx_walk.runs.scores import BEST, FINAL, Scores, write_scores
 from mjx_walk.training.distributed import Processes
-from mjx_walk.training.distributed_checkpoint import NUM_DEVICES, device_folder, restore_newest
+from mjx_walk.training.distributed_checkpoint import NUM_DEVICES, SEEDS_TOGETHER, device_folder, restore_newest
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.film import Filmer
 
@@ -31,7 +31,15 @@ class Recorder:
     Where a file cannot be written, or the folder has vanished, methods raise `UserError`.
     """
 
-    def __init__(self, config: Config, task: Task, algorithm: Algorithm, folder: RunFolder, processes: Processes):
+    def __init__(
+        self,
+        config: Config,
+        task: Task,
+        algorithm: Algorithm,
+        folder: RunFolder,
+        processes: Processes,
+        seeds_together: int = 1,
+    ):
         """
         Args:
             config: checked configuration.
@@ -39,12 +47,14 @@ class Recorder:
             algorithm: algorithm of this run, on one device.
             folder: prepared run folder.
             processes: processes that train the run.
+            seeds_together: runs that train in one program.
         """
         self.config = config
         self._task = task
         self._algorithm = algorithm
         self._folder = folder
         self._processes = processes
+        self._seeds_together = seeds_together
         self._steps_per_iteration = algorithm.steps_per_iteration * processes.process_count
         self._checkpoints = device_folder(folder.checkpoints, processes.process_index)
         self._saver = BackgroundSaver(self._checkpoints, config.checkpoint.keep, as_yaml(config))
@@ -59,13 +69,14 @@ class Recorder:
     def _is_main_process(self) -> bool:
         return self._processes.is_main_process
 
-    def restore(self, like: TrainState) -> tuple[TrainState, dict[str, Any]]:
-        """Restore the newest saved TrainState, and its `env_steps` and `wall_seconds`.
+    def restore(self, like: TrainState, at_most: int | None = None) -> tuple[TrainState, dict[str, Any]]:
+        """Restore the newest saved TrainState, and its `env_steps`, `wall_seconds` and `seeds_together`.
 
         Args:
             like: TrainState of shapes and dtypes.
+            at_most: environment steps that it may have at most.
         """
-        state, facts = restore_newest(self._folder.checkpoints, like, self._processes)
+        state, facts = restore_newest(self._folder.checkpoints, like, self._processes, at_most)
         self._restored_facts = facts
         return state, facts
 
@@ -106,7 +117,12 @@ class Recorder:
 
         A state with a replay buffer may take long to save.
         """
-        facts = {"env_steps": env_steps, "wall_seconds": wall_seconds, NUM_DEVICES: self._processes.process_count}
+        facts = {
+            "env_steps": env_steps,
+            "wall_seconds": wall_seconds,
+            NUM_DEVICES: self._processes.process_count,
+            SEEDS_TOGETHER: self._seeds_together,
+        }
         if self._writer:
             facts |= self._writer.mark
         parts = [Part(checkpoint.step_path(self._checkpoints, env_steps), state, facts)]

@@ -17,7 +17,6 @@ from mjx_walk.algos import TrainState, learned_leaves, make_algorithm, without_r
 from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
 from mjx_walk.envs.vector_env import check_resets
-from mjx_walk.runs.checkpoint import list_steps
 from mjx_walk.runs.config import Config
 from mjx_walk.runs.loggers import Progress
 from mjx_walk.runs.metrics import Row, name_metrics, physics_warnings
@@ -26,6 +25,7 @@ from mjx_walk.training.call_profile import CallProfile
 from mjx_walk.training.distributed import Processes, make_devices_program, per_device
 from mjx_walk.training.programs import Program, make_init, make_seeds_program, make_single_program
 from mjx_walk.training.recorder import Recorder
+from mjx_walk.training.seeds_together import have_saved, restore_together
 from mjx_walk.training.summary import end_lines, score_lines
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
@@ -74,7 +74,7 @@ class Trainer:
         self._algorithm = algorithm
         self._steps_per_iteration = algorithm.steps_per_iteration * count
         self.recorders = [
-            Recorder(own, task, algorithm, folder, self._processes)
+            Recorder(own, task, algorithm, folder, self._processes, len(configs))
             for own, folder in zip(configs, folders, strict=True)
         ]
         self.steps_per_call = self._steps_per_iteration * config.iterations_per_call
@@ -171,21 +171,17 @@ class Trainer:
     def _start(self) -> tuple[TrainState, int]:
         """Initial or restored TrainState, and the number of completed calls."""
         keys = [jax.random.PRNGKey(recorder.config.seed) for recorder in self.recorders]
-        if not self.config.resume or not any(list_steps(folder.checkpoints) for folder in self._folders):
+        if not self.config.resume or not have_saved(self._folders):
             for folder in self._folders:
                 if self.config.resume and folder.metrics.exists():
                     warnings.warn(f"{folder.path} has no checkpoint; training restarts from step 0", stacklevel=2)
             state = self._program.init(keys)
             check_resets(state.env)
             return state, 0
-        like = jax.eval_shape(make_init(self._algorithm.init), keys[0])
-        restored = [recorder.restore(like) for recorder in self.recorders]
-        steps = {facts["env_steps"] for _, facts in restored}
-        if len(steps) > 1:
-            at = ", ".join(f"{step:,}" for step in sorted(steps))
-            raise UserError(f"the seeds are at different steps ({at}); resume each alone")
+        restored = restore_together(self.recorders, jax.eval_shape(make_init(self._algorithm.init), keys[0]))
         self._seconds_before = max(facts["wall_seconds"] for _, facts in restored)
-        return self._program.merge([state for state, _ in restored]), steps.pop() // self.steps_per_call
+        calls = restored[0][1]["env_steps"] // self.steps_per_call
+        return self._program.merge([state for state, _ in restored]), calls
 
     def _end(self, state: TrainState, call: int, is_stopped: bool) -> None:
         """Close the run folders. A run that stops early waits for its saves here, since no scoring follows."""

@@ -170,8 +170,9 @@ def test_a_folder_that_vanishes_stops_the_run_and_is_not_made_again(run):
     says = f"{folder.path} has vanished, and with it what was saved"
     with pytest.raises(UserError, match=says):
         recorder.write(ROW)
+    recorder.save(state, env_steps=4, wall_seconds=1.0)
     with pytest.raises(UserError, match=says):
-        recorder.save(state, env_steps=4, wall_seconds=1.0)
+        recorder.wait()
     recorder.close()
     assert not folder.path.exists()
 

@@ -7,8 +7,11 @@ import pytest
 from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, leaves, train, train_here
 
 from mjx_walk import train as train_command
+from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import load_config
+from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.saved_config import save_config
+from mjx_walk.training.seeds_together import have_saved, restore_together
 from mjx_walk.utils.errors import UserError
 
 SEEDS = "seeds=[3,5]"
@@ -70,6 +73,42 @@ def test_seeds_side_by_side_resume_exactly_and_each_may_go_on_alone(tmp_path):
     with pytest.raises(AssertionError, match=r"error: the seeds are at different steps \(128, 256\); resume"):
         train(tmp_path / "one", f"total_steps={6 * TINY_CALL}", "resume=true", SEEDS, tiny=[])
     assert (tmp_path / "one" / "seed_3" / "config.yaml").read_text() == before
+
+
+class Saved:
+    """A recorder with checkpoints at some steps."""
+
+    def __init__(self, steps, seeds_together):
+        self.steps, self.facts = steps, {"seeds_together": seeds_together}
+
+    def restore(self, like, at_most=10**9):
+        return like, self.facts | {"env_steps": max((step for step in self.steps if step <= at_most), default=0)}
+
+
+def restored_steps(*recorders):
+    return [facts["env_steps"] for _, facts in restore_together(list(recorders), None)]
+
+
+def test_seeds_that_a_kill_has_parted_go_back_to_the_step_of_all():
+    with pytest.warns(UserWarning, match="not all seeds were saved at step 128; all resume from step 64"):
+        assert restored_steps(Saved([64, 128], 2), Saved([64], 2)) == [64, 64]
+    for ahead in (Saved([64, 128], 1), Saved([128], 2)):  # it went on alone; it has not kept that step
+        with pytest.raises(UserError, match=r"the seeds are at different steps \(64, 128\); resume each alone"):
+            restored_steps(ahead, Saved([64], 2))
+
+
+@pytest.mark.parametrize(("steps", "facts", "is_refused"), [([64], 2, False), ([64], 1, True), ([64, 128], 2, True)])
+def test_seeds_that_a_kill_has_parted_at_their_first_save_begin_again(tmp_path, steps, facts, is_refused):
+    folders = [RunFolder(tmp_path / f"seed_{seed}") for seed in (0, 1)]
+    for step in steps:
+        path = checkpoint.step_path(folders[1].checkpoints, step)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        checkpoint.save(path, {"a": 1.0}, {"env_steps": step, "seeds_together": facts}, as_numpy=True)
+    if not is_refused:
+        assert not have_saved(folders)
+        return
+    with pytest.raises(UserError, match=rf"the seeds are at different steps \(0, {steps[-1]}\); resume each alone"):
+        have_saved(folders)
 
 
 def test_nothing_is_begun_where_one_seed_cannot_be(tmp_path, monkeypatch):
