@@ -7,8 +7,11 @@ does, are in no cache. `_QUICK_COMPILE` cuts compile times. `helpers.OPTIMIZED` 
 
 import atexit
 import os
+import random
 import shutil
 import tempfile
+
+import pytest
 
 os.environ["JAX_PLATFORMS"] = "cpu"
 _QUICK_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
@@ -34,3 +37,23 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 def pytest_addoption(parser):
     parser.addoption("--faults", type=int, default=200, help="kills, and damages, of `-m campaign`")
     parser.addoption("--fault-seed", default="0", help="seed of the random faults")
+
+
+@pytest.fixture
+def rng(request):
+    """Random numbers of a campaign of faults."""
+    return random.Random(f"{request.config.getoption('--fault-seed')} {request.node.name}")
+
+
+@pytest.fixture
+def num_faults(request):
+    return request.config.getoption("--faults")
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    from faults import Server
+
+    server = Server(tmp_path_factory.mktemp("output"))
+    yield server
+    server.close()

@@ -12,13 +12,24 @@ import time
 from pathlib import Path
 
 import numpy as np
-from helpers import ENVIRONMENT, saved_leaves
+from helpers import ENVIRONMENT, TINY, TINY_OFF_POLICY, saved_leaves
 
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.scores import POLICIES
 
 HANG = 180.0
 """Seconds after which a command counts as hanging."""
+CALLS = 40
+"""Program calls of a run."""
+EACH_CALL = ("checkpoint.every_calls=1", "algo.policy_hidden_layer_sizes=[16]")
+RUNS = {
+    "ppo": (*TINY, *EACH_CALL),
+    "sac": (*TINY_OFF_POLICY, "algo=sac", *EACH_CALL),
+    "csac": (*TINY_OFF_POLICY, "algo=csac", *EACH_CALL),
+    "td3": (*TINY_OFF_POLICY, "algo=td3", *EACH_CALL),
+    "seeds": (*TINY, *EACH_CALL, "seeds=2"),
+    "devices": (*TINY, *EACH_CALL, "devices=2"),
+}
 
 
 class Command:
@@ -107,6 +118,24 @@ def run_as_command(output, *arguments):
     sys.argv = ["mjx_walk.train", *arguments]
     sys.modules.pop("mjx_walk.train")
     runpy.run_module("mjx_walk.train", run_name="__main__", alter_sys=True)
+
+
+def arguments_of(name, run_dir):
+    steps = CALLS * 64 * (2 if name == "devices" else 1)
+    return [*RUNS[name], f"run_dir={run_dir}", f"total_steps={steps}"]
+
+
+def resumed(name, run_dir):
+    """The same command, which resumes a run that has begun."""
+    has_begun = any(path.stat().st_size for path in run_dir.rglob("config.yaml"))
+    return [*arguments_of(name, run_dir), *(["resume=true"] if has_begun else [])]
+
+
+def trained(server, name, run_dir):
+    """A run that nothing has disturbed."""
+    done = server.start(*arguments_of(name, run_dir))
+    assert done.wait() == 0, done.printed
+    return run_dir
 
 
 def num_rows(run_dir):

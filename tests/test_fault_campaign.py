@@ -1,10 +1,9 @@
-"""Runs that are killed, interrupted, started twice or left without a disk lose nothing, and go on bit for bit.
+"""Runs that are killed lose nothing: each goes on bit for bit as if nothing had happened.
 
 `pytest -m campaign -n 0 -s` tries 200 kills and 200 damages; `--faults N` and `--fault-seed N` choose others.
 """
 
 import os
-import random
 import shutil
 import signal
 import subprocess
@@ -12,57 +11,11 @@ import sys
 import time
 
 import pytest
-from faults import Server, Tally, differences, num_rows, wait_for_new_rows
-from helpers import TINY, TINY_OFF_POLICY, command
+from faults import RUNS, Tally, arguments_of, differences, num_rows, resumed, trained, wait_for_new_rows
+from helpers import command
 
-CALLS = 40
-"""Program calls of a run."""
-EACH_CALL = ("checkpoint.every_calls=1", "algo.policy_hidden_layer_sizes=[16]")
-RUNS = {
-    "ppo": (*TINY, *EACH_CALL),
-    "sac": (*TINY_OFF_POLICY, "algo=sac", *EACH_CALL),
-    "csac": (*TINY_OFF_POLICY, "algo=csac", *EACH_CALL),
-    "td3": (*TINY_OFF_POLICY, "algo=td3", *EACH_CALL),
-    "seeds": (*TINY, *EACH_CALL, "seeds=2"),
-    "devices": (*TINY, *EACH_CALL, "devices=2"),
-}
 SHARES = {"ppo": 0.25, "sac": 0.2, "csac": 0.2, "td3": 0.15, "seeds": 0.15, "devices": 0.05}
 """Parts of the kills."""
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    server = Server(tmp_path_factory.mktemp("output"))
-    yield server
-    server.close()
-
-
-@pytest.fixture
-def rng(request):
-    return random.Random(f"{request.config.getoption('--fault-seed')} {request.node.name}")
-
-
-@pytest.fixture
-def num_faults(request):
-    return request.config.getoption("--faults")
-
-
-def arguments_of(name, run_dir):
-    steps = CALLS * 64 * (2 if name == "devices" else 1)
-    return [*RUNS[name], f"run_dir={run_dir}", f"total_steps={steps}"]
-
-
-def resumed(name, run_dir):
-    """The same command, which resumes a run that has begun."""
-    has_begun = any(path.stat().st_size for path in run_dir.rglob("config.yaml"))
-    return [*arguments_of(name, run_dir), *(["resume=true"] if has_begun else [])]
-
-
-def trained(server, name, run_dir):
-    """A run that nothing has disturbed."""
-    done = server.start(*arguments_of(name, run_dir))
-    assert done.wait() == 0, done.printed
-    return run_dir
 
 
 def kill_again_and_again(server, name, tmp_path, rng, count):

@@ -1,11 +1,11 @@
 """The facts stored with a checkpoint, checked before they are used: the file may come from anywhere."""
 
 import json
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from mjx_walk.utils.checksums import take_checksum, with_checksum
 from mjx_walk.utils.files import write_text
 from mjx_walk.utils.versions import __version__
 
@@ -14,8 +14,6 @@ __all__ = ["FORMAT", "read_facts", "write_facts"]
 FORMAT = 1
 """Version of the checkpoint format. Increment it when a change makes older checkpoints unreadable."""
 
-_CHECKSUM = "checksum"
-"""Name of the checksum of all other facts. Earlier versions wrote none."""
 _MAX_BYTES = 10_000_000
 _MAX_NUMBER = 1e300
 _REQUIRED = ("env_steps", "crc32")
@@ -24,7 +22,7 @@ _REQUIRED = ("env_steps", "crc32")
 def write_facts(path: Path, facts: dict[str, Any]) -> None:
     """Write a `meta.json`, with the versions and a checksum."""
     facts = {"format": FORMAT, "mjx_walk": __version__} | facts
-    write_text(path, json.dumps(facts | {_CHECKSUM: _checksum(facts)}))
+    write_text(path, json.dumps(with_checksum(facts)))
 
 
 def read_facts(path: Path) -> dict[str, Any]:
@@ -49,14 +47,9 @@ def read_facts(path: Path) -> dict[str, Any]:
             raise ValueError(f"{path}: {name} should be {valid}, found {_shown(facts[name])}")
         if name in _REQUIRED and name not in facts:
             raise ValueError(f"{path}: {name} should be {valid}, found nothing")
-    checksum = facts.pop(_CHECKSUM, None)
-    if checksum is not None and facts.get("format") == FORMAT and checksum != _checksum(facts):
+    if not take_checksum(facts) and facts.get("format") == FORMAT:
         raise ValueError(f"{path.parent} is damaged: {path.name} does not match its checksum")
     return facts
-
-
-def _checksum(facts: dict[str, Any]) -> int:
-    return zlib.crc32(json.dumps(facts, sort_keys=True).encode())
 
 
 def _is_count(value: Any, at_least: int = 0) -> bool:

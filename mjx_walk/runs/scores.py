@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_walk.utils.checksums import take_checksum, with_checksum
 from mjx_walk.utils.files import write_text
 from mjx_walk.utils.versions import package_versions
 
@@ -84,7 +85,7 @@ class ScoreFile:
 
 
 def write_scores(path: Path, env: str, blocks: dict[str, dict[str, Any]], **facts: Any) -> None:
-    """Write scores as JSON, with the versions of the packages.
+    """Write scores as JSON, with the versions of the packages and a checksum.
 
     Args:
         path: file to replace.
@@ -93,14 +94,14 @@ def write_scores(path: Path, env: str, blocks: dict[str, dict[str, Any]], **fact
         facts: JSON-serializable facts about the run.
     """
     content = {"env": env, **blocks, **facts} | {"versions": package_versions()}
-    write_text(path, json.dumps(content, indent=1))
+    write_text(path, json.dumps(with_checksum(content), indent=1))
 
 
 def read_scores(path: Path) -> ScoreFile:
     """Read scores that `write_scores` wrote. A file with one block, of an older version, loads as well.
 
     Raises:
-        ValueError: the file is not of this format.
+        ValueError: the file is not of this format, or was changed.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -108,6 +109,8 @@ def read_scores(path: Path) -> ScoreFile:
         raise ValueError(f"{path} is nested too deeply") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path} holds no object")
+    if not take_checksum(content):
+        raise ValueError(f"{path} was changed after it was written: its checksum does not match")
     env = content.pop("env", "")
     if "returns" in content:  # one block, without a name
         names = ("mean", "std", "returns", "lengths", "seeds", "env_steps")
