@@ -1,36 +1,33 @@
-"""Folders of named arrays, as Orbax checkpoints or NumPy archives.
+"""Folders of named arrays, in Orbax's format or as NumPy archives.
 
 A reader trusts no file: before it reads an array, it compares the declared shape and type with the expected ones.
 """
 
 import contextlib
 import errno
-import logging
+import json
 import math
 import os
 import re
 import shutil
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
-import orbax.checkpoint as ocp
 import tensorstore
 
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import write_text
 
 __all__ = ["HostArrays", "read_arrays", "write_arrays"]
 
 _NUMPY = "arrays.npz"
-"""File that replaces Orbax's files for small pytrees, in processes other than the main one, and below folders in which
-Orbax does not find its files."""
-_SEPARATOR = "\\"
-"""TensorStore takes it for a separator of folders on every system."""
-_NOT_FOR_ORBAX = frozenset("*?[" + _SEPARATOR)
-"""Characters of a path with which Orbax does not find its own files. It takes the first three for a pattern."""
+"""File that replaces Orbax's files for small pytrees, and in folders of earlier versions for other processes."""
+_METADATA = "_METADATA"
+"""Orbax's file about the arrays in a folder."""
 
 HostArrays = dict[str, np.ndarray]
 """Host copies of a pytree's leaves, by path."""
@@ -47,20 +44,55 @@ def write_arrays(path: Path, arrays: HostArrays, as_numpy: bool = False) -> None
     Raises:
         OSError: writing failed, for example because the disk is full.
     """
-    path = path.resolve()
     _check_space(path.parent, sum(array.nbytes for array in arrays.values()))
-    # Orbax writes host arrays only from the main process.
-    if as_numpy or jax.process_index() or _NOT_FOR_ORBAX & {*str(path)}:
-        path.mkdir()
-        write = np.savez_compressed if as_numpy else np.savez
-        write(path / _NUMPY, allow_pickle=False, **arrays)
+    path.mkdir()
+    if as_numpy:
+        np.savez_compressed(path / _NUMPY, allow_pickle=False, **arrays)
         return
-    with _as_os_error(path), _without_logs_of_orbax(), _checkpointer() as checkpointer:
-        checkpointer.save(path, arrays)
+    with _as_os_error(path), _store(path) as store:
+        _write_tensorstore(store, arrays)
+    write_text(path / _METADATA, json.dumps(_metadata_of_orbax(arrays)))
+
+
+def _write_tensorstore(base: dict[str, Any], arrays: HostArrays) -> None:
+    """Write all arrays in one transaction, each in one chunk, as Orbax does with its defaults.
+
+    Orbax itself writes in an event loop of a thread. Where a write fails, it leaves other writes behind, which print
+    tracebacks from TensorStore's threads.
+    """
+    context, transaction = tensorstore.Context(), tensorstore.Transaction()
+    opening = [
+        tensorstore.open(
+            {
+                "driver": "zarr",
+                "kvstore": base | {"path": f"{name}/"},
+                "metadata": {"compressor": {"id": "zstd", "level": 1}, "chunks": [max(n, 1) for n in array.shape]},
+                "store_data_equal_to_fill_value": True,
+            },
+            create=True,
+            dtype=array.dtype,
+            shape=array.shape,
+            context=context,
+            transaction=transaction,
+        )
+        for name, array in arrays.items()
+    ]
+    writing = [store.result().write(array) for store, array in zip(opening, arrays.values(), strict=True)]
+    for written in writing:
+        written.result()
+    transaction.commit_sync()
+
+
+def _metadata_of_orbax(arrays: HostArrays) -> dict[str, Any]:
+    """What Orbax reads to restore the arrays as a dictionary."""
+    value = {"value_type": "np.ndarray", "skip_deserialize": False}
+    tree = {str((name,)): {"key_metadata": [{"key": name, "key_type": 2}], "value_metadata": value} for name in arrays}
+    formats = {"use_ocdbt": True, "use_zarr3": False, "store_array_data_equal_to_fill_value": True}
+    return {"tree_metadata": tree} | formats | {"custom_metadata": None}
 
 
 def _check_space(folder: Path, num_bytes: int) -> None:
-    """Check that a disk has room for arrays. Orbax leaves threads behind if it has not."""
+    """Check that a disk has room for arrays, before a part of them is written."""
     disk = shutil.disk_usage(folder)
     if disk.total and disk.free < num_bytes:  # some network file systems do not know their size
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
@@ -79,18 +111,19 @@ def _as_os_error(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _without_logs_of_orbax() -> Iterator[None]:
-    """Context manager that hides the tracebacks that Orbax logs from its threads. It raises the same errors."""
-    logger = logging.getLogger("absl")
-    logger.addFilter(_is_no_error)
-    try:
-        yield
-    finally:
-        logger.removeFilter(_is_no_error)
+def _store(path: Path) -> Iterator[dict[str, Any]]:
+    """Context manager for TensorStore's description of the files in a folder.
 
-
-def _is_no_error(record: logging.LogRecord) -> bool:
-    return record.levelno < logging.ERROR
+    TensorStore takes a backslash for a separator of folders, so a link without one leads to a path that has it.
+    """
+    full = path.resolve()  # TensorStore refuses `..`
+    with contextlib.ExitStack() as link:
+        if "\\" in str(full):
+            plain = Path(link.enter_context(tempfile.TemporaryDirectory()), "link")
+            plain.symlink_to(full)
+            full = plain
+        # A URL would read some characters of a path as its own syntax.
+        yield {"driver": "ocdbt", "base": {"driver": "file", "path": f"{full}/"}}
 
 
 def read_arrays(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:
@@ -138,29 +171,25 @@ def _read_numpy(path: Path, expected: Mapping[str, Any], present_name: Callable[
 
 def _read_orbax(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:
     """Read Orbax's files with TensorStore, which shows the metadata of an array before it reads the array."""
-    full = str(path.resolve())  # TensorStore refuses `..`
-    if _SEPARATOR in full:
-        raise UserError(f"{full} has a backslash, which TensorStore takes for a separator; rename the folder")
-    # A URL would read some characters of a path as its own syntax.
-    base = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{full}/"}}
-    context = tensorstore.Context()
-    keys = tensorstore.KvStore.open(base, context=context).result().list().result()
-    stored = [key.decode().removesuffix("/.zarray") for key in keys if key.endswith(b"/.zarray")]
-    wanted = {present_name(name): name for name in stored if present_name(name) in expected}
-    opening = {
-        name: tensorstore.open(
-            {"driver": "zarr", "kvstore": base | {"path": f"{old}/"}}, open=True, read=True, context=context
-        )
-        for name, old in wanted.items()
-    }
-    stores = {name: future.result() for name, future in opening.items()}
-    for name, store in stores.items():
-        _check(path, name, expected[name], store.shape, store.dtype.numpy_dtype)
-        chunk = store.chunk_layout.read_chunk.shape or ()
-        if any(size is None or size > max(length, 1) for size, length in zip(chunk, store.shape, strict=True)):
-            raise ValueError(f"{name} has larger pieces than its shape")
-    reading = {name: store.read() for name, store in stores.items()}
-    return {name: np.asarray(future.result()) for name, future in reading.items()}
+    with _store(path) as base:
+        context = tensorstore.Context()
+        keys = tensorstore.KvStore.open(base, context=context).result().list().result()
+        stored = [key.decode().removesuffix("/.zarray") for key in keys if key.endswith(b"/.zarray")]
+        wanted = {present_name(name): name for name in stored if present_name(name) in expected}
+        opening = {
+            name: tensorstore.open(
+                {"driver": "zarr", "kvstore": base | {"path": f"{old}/"}}, open=True, read=True, context=context
+            )
+            for name, old in wanted.items()
+        }
+        stores = {name: future.result() for name, future in opening.items()}
+        for name, store in stores.items():
+            _check(path, name, expected[name], store.shape, store.dtype.numpy_dtype)
+            chunk = store.chunk_layout.read_chunk.shape or ()
+            if any(size is None or size > max(length, 1) for size, length in zip(chunk, store.shape, strict=True)):
+                raise ValueError(f"{name} has larger pieces than its shape")
+        reading = {name: store.read() for name, store in stores.items()}
+        return {name: np.asarray(future.result()) for name, future in reading.items()}
 
 
 def _check(path: Path, name: str, expected: Any, shape: tuple[int, ...], dtype: np.dtype) -> None:
@@ -172,13 +201,3 @@ def _check(path: Path, name: str, expected: Any, shape: tuple[int, ...], dtype: 
             f"{path.parent} belongs to another run or version: "
             f"{name} should be {expected.shape} {expected.dtype}, found {tuple(shape)} {dtype}"
         )
-
-
-def _checkpointer() -> ocp.Checkpointer:
-    """Orbax's checkpointer for this process alone. By default, Orbax waits for all processes."""
-    options = ocp.options.MultiprocessingOptions()
-    if jax.process_count() > 1:
-        rank = jax.process_index()
-        options = ocp.options.MultiprocessingOptions(rank, {rank}, f"process_{rank}")
-    handler = ocp.PyTreeCheckpointHandler(use_ocdbt=True, use_zarr3=False, multiprocessing_options=options)
-    return ocp.Checkpointer(handler, multiprocessing_options=options)

@@ -1,4 +1,4 @@
-"""Save and restore a complete TrainState with Orbax, atomically and with checksums.
+"""Save and restore a complete TrainState in Orbax's format, atomically and with checksums.
 
 Orbax's CheckpointManager treats all parts of a step alike and synchronizes all processes at each save. Here, only the
 newest step keeps its replay buffer, and each process writes its own folder.

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 import tensorstore
 from helpers import CLONE, ENVIRONMENT
@@ -25,6 +26,7 @@ EXPECTED = {
     "c": np.asarray(jnp.arange(3, dtype=jnp.bfloat16)),
     "d": np.asfortranarray(np.arange(6.0).reshape(2, 3)),
     "empty": np.zeros((0, 4), np.float32),
+    "zero": np.array([0.0, -0.0], np.float32),
     "flag": np.array([True, False]),
 }
 HUGE = 1_500_000_000
@@ -65,13 +67,23 @@ def zarr(folder, metadata, value=None):
 
 @pytest.mark.parametrize("as_numpy", [True, False])
 def test_round_trip_keeps_every_bit_shape_and_type(tmp_path, as_numpy):
-    arrays = {name: array for name, array in EXPECTED.items() if as_numpy or array.size}  # Orbax saves no empty ones
-    write_arrays(tmp_path / "x", arrays, as_numpy)
-    found = read_arrays(tmp_path / "x", arrays, same)
-    assert found.keys() == arrays.keys()
-    for name, array in arrays.items():
+    write_arrays(tmp_path / "x", EXPECTED, as_numpy)
+    found = read_arrays(tmp_path / "x", EXPECTED, same)
+    assert found.keys() == EXPECTED.keys()
+    for name, array in EXPECTED.items():
         assert (found[name].shape, found[name].dtype) == (array.shape, array.dtype)
         assert found[name].tobytes() == array.tobytes()
+
+
+def test_orbax_reads_what_is_written(tmp_path):
+    arrays = {name: array for name, array in EXPECTED.items() if array.size}
+    write_arrays(tmp_path / "x", arrays)
+    with ocp.PyTreeCheckpointer() as checkpointer:
+        found = checkpointer.restore(tmp_path / "x")
+    assert found.keys() == arrays.keys()
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(found[name], array)
+        assert found[name].dtype == array.dtype
 
 
 @pytest.mark.parametrize(
@@ -252,7 +264,7 @@ def test_a_folder_may_have_any_name(name, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-@pytest.mark.parametrize("name", ["?", "[x]", "*", "50%41 #a"])
+@pytest.mark.parametrize("name", ["?", "[x]", "*", "50%41 #a", "back\\slash"])
 def test_arrays_that_are_moved_to_a_folder_of_any_name_can_be_read(name, tmp_path):
     write_arrays(tmp_path / "fine", {"a": EXPECTED["a"]})
     (tmp_path / "fine").rename(tmp_path / name)
@@ -266,10 +278,3 @@ def test_a_path_may_lead_through_parents_and_links(tmp_path, monkeypatch):
     for path in (Path("../back"), Path("a"), tmp_path / "link" / ".." / "b"):
         write_arrays(path, {"a": EXPECTED["a"]})
         np.testing.assert_array_equal(read_arrays(path, EXPECTED, same)["a"], EXPECTED["a"])
-
-
-def test_a_run_that_is_moved_to_where_orbax_cannot_read_it_says_so(tmp_path):
-    write_arrays(tmp_path / "fine", {"a": EXPECTED["a"]})
-    (tmp_path / "fine").rename(tmp_path / "back\\slash")
-    with pytest.raises(UserError, match="has a backslash, which TensorStore takes for a separator; rename the folder"):
-        read_arrays(tmp_path / "back\\slash", EXPECTED, same)
