@@ -90,8 +90,17 @@ def replacing(path: Path, mode: int = 0o666) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Wait until a file's content, or a folder's list of names, is on the disk."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    """Wait until a file's content, or a folder's list of names, is on the disk.
+
+    A link to a folder is followed. A folder that the user may not list is left to the file system.
+    """
+    is_folder = path.is_dir()
+    try:
+        descriptor = os.open(path, os.O_RDONLY if is_folder else os.O_RDONLY | os.O_NOFOLLOW)
+    except PermissionError:
+        if is_folder:
+            return
+        raise
     try:
         os.fsync(descriptor)
     except OSError as error:
@@ -183,7 +192,10 @@ class Appender:
 
     def sync(self) -> None:
         """Wait until the content is on the disk."""
-        os.fsync(self._descriptor)
+        try:
+            os.fsync(self._descriptor)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self._path)) from error
 
     def close(self) -> None:
         """Close the file."""

@@ -5,6 +5,7 @@ import subprocess
 
 import pytest
 
+from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import load_config
 from mjx_walk.runs.preparation import prepared
 from mjx_walk.utils.errors import UserError
@@ -37,6 +38,16 @@ def test_a_seed_that_is_in_use_frees_the_others(here, tmp_path):
         prepared(seeds).__enter__()
     with prepared([seeds[0]]) as (folders, _):
         assert folders[0].config.exists()
+
+
+def test_a_link_may_lead_to_the_folder_of_the_runs(config, tmp_path):
+    (tmp_path / "disk" / "x").mkdir(parents=True)
+    (tmp_path / "runs").symlink_to(tmp_path / "disk")
+    (tmp_path / "disk" / "link").symlink_to(tmp_path / "disk" / "x")
+    for run_dir in ("runs/run", "runs/link"):
+        with prepared([dataclasses.replace(config, run_dir=f"{tmp_path}/{run_dir}")]) as (folders, _):
+            checkpoint.save(folders[0].policy("best"), {"a": 1.0}, {"env_steps": 0})
+        assert (tmp_path / run_dir / "config.yaml").exists()
 
 
 def test_a_child_process_that_lives_on_does_not_keep_the_lock(here):
