@@ -16,6 +16,7 @@ import numpy as np
 
 from mjx_walk.runs.arrays import HostArrays, read_arrays, write_arrays
 from mjx_walk.runs.facts import FORMAT, read_facts, write_facts
+from mjx_walk.runs.scores import POLICIES
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import write_text
 from mjx_walk.utils.folders import discard, find_written, remove_unfinished, replacing_folder
@@ -232,8 +233,8 @@ def prune(folder: Path, keep: int, newest: str | None = None) -> None:
     for path in list_steps(folder)[:-1]:
         if (path / _REPLAY).exists():
             discard(path / _REPLAY)
-        remove_unfinished(path, _META)
-    remove_unfinished(folder, _META)
+        remove_unfinished(path)
+    remove_unfinished(folder, keep=[find(folder / name) for name in POLICIES])
 
 
 def _is_replay(name: str) -> bool:

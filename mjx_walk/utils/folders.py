@@ -3,7 +3,7 @@
 import contextlib
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from mjx_walk.utils.files import fresh_name, sync, sync_tree
@@ -31,11 +31,12 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         os.replace(unfinished, path)
         sync(path.parent)
     except BaseException:
-        if former.exists():
+        if former.exists() and not path.exists():
             os.replace(former, path)
         raise
     finally:
-        _remove(former)
+        if path.exists():
+            _remove(former)
         _remove(unfinished)
 
 
@@ -60,11 +61,15 @@ def discard(path: Path) -> None:
     _remove(hidden)
 
 
-def remove_unfinished(folder: Path, last_file: str) -> None:
-    """Remove what crashes have left in a folder, except what `find_written` finds."""
+def remove_unfinished(folder: Path, keep: Collection[Path | None] = ()) -> None:
+    """Remove what crashes have left in a folder.
+
+    Args:
+        folder: where `replacing_folder` and `discard` have been called.
+        keep: results of `find_written`.
+    """
     for path in folder.glob(f".*{_UNFINISHED}"):
-        name = path.name[1:].removesuffix(_UNFINISHED).rpartition(".")[0]
-        if find_written(folder / name, last_file) != path:
+        if path not in keep:
             _remove(path)
 
 

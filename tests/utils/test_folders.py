@@ -45,10 +45,10 @@ def test_a_crash_before_any_rename_leaves_the_new_folder_or_the_old_one(tmp_path
             write(path, "new")
     assert path.exists() == (call == 1)
     assert text_of(path) == ("old" if call == 1 else "new")
-    remove_unfinished(tmp_path, "last")
+    remove_unfinished(tmp_path, keep=[find_written(path, "last")])
     assert text_of(path) == ("old" if call == 1 else "new") and len(list(tmp_path.iterdir())) == 1
     write(path, "newer")
-    remove_unfinished(tmp_path, "last")
+    remove_unfinished(tmp_path, keep=[find_written(path, "last")])
     assert text_of(path) == "newer" and [folder.name for folder in tmp_path.iterdir()] == ["best"]
 
 
@@ -56,7 +56,7 @@ def test_a_half_written_folder_is_not_found(tmp_path):
     half = tmp_path / f".best.{'0' * 16}.unfinished"
     half.mkdir()
     assert find_written(tmp_path / "best", "last") is None
-    remove_unfinished(tmp_path, "last")
+    remove_unfinished(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -84,6 +84,25 @@ def test_a_folder_is_gone_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(folders, "_remove", lambda path: None)
     discard(tmp_path / "old")
     assert not (tmp_path / "old").exists()
+    monkeypatch.undo()
+    remove_unfinished(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_after_the_last_rename_is_the_one_that_is_raised(tmp_path, monkeypatch):
+    path = tmp_path / "best"
+    write(path, "old")
+    sync = folders.sync
+
+    def failing(synced):
+        if synced == tmp_path:
+            raise OSError(5, "Input/output error")
+        sync(synced)
+
+    monkeypatch.setattr(folders, "sync", failing)
+    with pytest.raises(OSError, match="Input/output error"):
+        write(path, "new")
+    assert text_of(path) == "new" and list(tmp_path.iterdir()) == [path]
 
 
 def test_no_folder_appears_where_the_one_above_has_vanished(tmp_path):
