@@ -1,7 +1,7 @@
 """Saves checkpoints in a thread, so that training continues."""
 
 from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent import futures
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,8 +31,8 @@ class BackgroundSaver:
         self._folder = folder
         self._keep = keep
         self._config = config
-        self._executor = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
-        self._running: Future[None] | None = None
+        self._executor = futures.ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
+        self._running: futures.Future[None] | None = None
 
     def save(self, *parts: Part) -> None:
         """Copy pytrees to the host and start to write them in order. Waits for the previous save first."""
@@ -46,8 +46,10 @@ class BackgroundSaver:
         Raises:
             OSError: writing failed, for example because the disk is full.
         """
-        running, self._running = self._running, None
+        running = self._running
         if running:
+            futures.wait([running])  # if Ctrl-C ends it, the next call waits again
+            self._running = None
             running.result()
 
     def _save(self, parts: Iterable[Part]) -> None:

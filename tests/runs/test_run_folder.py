@@ -128,6 +128,35 @@ def test_later_checkpoints_do_not_crowd_out_new_ones(tmp_path):
     assert [int(path.name) for path in checkpoint.list_steps(tmp_path)] == [10, 20]
 
 
+def test_an_interrupted_wait_does_not_forget_the_save(tmp_path, monkeypatch):
+    saver = BackgroundSaver(tmp_path, keep=1)
+    saver.save(Part(checkpoint.step_path(tmp_path, 10), {"a": 1.0}, {"env_steps": 10}))
+
+    def interrupted(running):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("mjx_walk.runs.background_saver.futures.wait", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            saver.wait()
+    saver.wait()
+    assert [path.name for path in tmp_path.iterdir()] == ["0000000000010"]
+
+
+def test_what_a_crash_left_of_a_checkpoint_is_removed_and_of_a_policy_is_kept(tmp_path):
+    for name in ("0000000000010", "0000000000020", "best", "final"):
+        checkpoint.save(tmp_path / name, {"a": 1.0}, {"env_steps": 10})
+    for name in ("0000000000010", "best"):
+        (tmp_path / name).rename(tmp_path / f".{name}.0123456789abcdef.unfinished")
+    checkpoint.prune(tmp_path, keep=2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        ".best.0123456789abcdef.unfinished",
+        "0000000000020",
+        "final",
+    ]
+    assert checkpoint.find(tmp_path / "best")
+
+
 def test_a_save_that_fails_leaves_nothing_behind(tmp_path):
     path = checkpoint.step_path(tmp_path, 10)
     checkpoint.save(path, {"a": 1.0}, {"env_steps": 10})
