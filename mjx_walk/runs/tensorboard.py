@@ -4,6 +4,7 @@ tensorboardX imports PyTorch where it is installed, which takes seconds. Nothing
 a thread and a queue: once a write has failed, the thread is gone, and the full queue blocks the training for ever.
 """
 
+import contextlib
 import secrets
 import socket
 import struct
@@ -62,9 +63,10 @@ class EventFile:
 
     def close(self) -> None:
         """Close the file."""
-        if self._file:
-            self._file.close()
-            self._file = None
+        file, self._file = self._file, None
+        if file:
+            with contextlib.suppress(OSError):  # a network file system may report a failed write only here
+                file.close()
 
     def _write(self, event: Event) -> None:
         """Append an event as a TFRecord: length, its checksum, content, its checksum."""

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -209,9 +210,10 @@ class Recorder:
             self._close_logs()
 
     def _close_logs(self) -> None:
-        if self._writer:
-            self._writer.close()
-            self._writer = None
+        writer, self._writer = self._writer, None
+        if writer:
+            with self._writing():
+                writer.close()
         if self._wandb:
             self._wandb.close()
             self._wandb = None
@@ -228,5 +230,5 @@ class Recorder:
             reason = error.strerror or error
             raise UserError(
                 f"cannot write {error.filename or folder}: {reason}; earlier checkpoints are complete; once it can be "
-                f"written, continue with run_dir={folder} resume=true"
+                f"written, continue with {shlex.quote(f'run_dir={folder}')} resume=true"
             ) from error
