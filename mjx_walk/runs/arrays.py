@@ -141,7 +141,7 @@ def read_arrays(path: Path, expected: Mapping[str, Any], present_name: Callable[
     read = _read_numpy if (path / _NUMPY).exists() else _read_orbax
     try:
         return read(path, expected, present_name)
-    except UserError:
+    except (UserError, MemoryError):
         raise
     except Exception as error:  # archives report damage with many exception types
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
