@@ -1,4 +1,4 @@
-"""Runs that are killed lose nothing: each goes on bit for bit as if nothing had happened.
+"""Killed runs lose nothing: each continues bit for bit like an undisturbed one.
 
 `pytest -m campaign -n 0 -s` tries 200 kills and 200 damages; `--faults N` and `--fault-seed N` choose others.
 """

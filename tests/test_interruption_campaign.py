@@ -1,4 +1,4 @@
-"""Signals, full disks, folders that vanish and second commands cost one line at most, and nothing of the run."""
+"""Signals, full disks, vanished folders and second commands print at most one line, and the run loses nothing."""
 
 import shutil
 import signal
@@ -88,7 +88,7 @@ def test_full_disks(server, reference, tmp_path, rng, num_faults):
 
 
 def test_folders_that_vanish(server, reference, tmp_path, rng, num_faults):
-    """Moved away, the run stops, and goes on from where it was moved to."""
+    """A run whose folder is moved stops. It resumes from the new place."""
     tally = Tally("vanished folders")
     for i in range(max(1, num_faults // 20)):
         run_dir, moved = tmp_path / f"run_{i}", tmp_path / f"moved_{i}"

@@ -57,7 +57,7 @@ def write_arrays(path: Path, arrays: HostArrays, as_numpy: bool = False) -> None
 def _write_tensorstore(base: dict[str, Any], arrays: HostArrays) -> None:
     """Write all arrays in one transaction, each in one chunk, as Orbax does with its defaults.
 
-    Orbax itself writes in an event loop of a thread. Where a write fails, it leaves other writes behind, which print
+    Orbax itself writes in an event loop of a thread. After a failed write its other writes continue, and print
     tracebacks from TensorStore's threads.
     """
     context, transaction = tensorstore.Context(), tensorstore.Transaction()

@@ -103,7 +103,7 @@ class MetricsWriter:
             new.write_bytes(b"".join(lines))
 
     def _reopen(self, row: Row) -> None:
-        """Go on in a new file if the old one was removed or replaced, but not in another folder."""
+        """Continue in a new file if the old one was removed or replaced, but not in another folder."""
         folder = os.stat(self._run_dir)
         if not os.path.samestat(folder, self._folder):
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self._run_dir))

@@ -43,7 +43,7 @@ def restore_together(recorders: list[Recorder], like: TrainState) -> list[tuple[
         like: TrainState of shapes and dtypes.
 
     Raises:
-        UserError: a run has no usable checkpoint, or some have gone on alone.
+        UserError: a run has no usable checkpoint, or some have continued alone.
     """
     restored = [recorder.restore(like) for recorder in recorders]
     steps = [facts["env_steps"] for _, facts in restored]

@@ -15,7 +15,11 @@ def with_checksum(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def take_checksum(content: dict[str, Any]) -> bool:
-    """Remove the checksum of a JSON object. Returns whether it matches; without one, which is older, it does."""
+    """Remove the checksum of a JSON object.
+
+    Returns:
+        Whether it matches. An object of an earlier version has none, and counts as matching.
+    """
     found = content.pop(_KEY, None)
     return found is None or found == _checksum(content)
 

@@ -41,7 +41,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
 
 def find_written(path: Path, last_file: str) -> Path | None:
-    """The folder at `path`; or, if a crash came before its last rename, the one that was to be there, or was before.
+    """The folder at `path`. If a crash came before its last rename, the newest complete one that was meant for `path`.
 
     Args:
         path: as given to `replacing_folder`.
