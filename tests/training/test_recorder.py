@@ -1,5 +1,6 @@
 """Which policies a run keeps and scores."""
 
+import dataclasses
 import shutil
 
 import jax
@@ -157,6 +158,18 @@ def test_the_next_save_of_a_resumed_run_keeps_what_its_state_holds_as_the_best(r
     params, facts = kept(folder, "best", algorithm, state)
     assert_same(params, best)
     assert facts == {"env_steps": 20, "eval_return": 10.0}
+
+
+@pytest.mark.parametrize(("seeds", "kept_steps"), [(1, [8]), (2, [4, 8])])
+def test_seeds_that_train_together_keep_a_checkpoint_that_all_of_them_have(run, seeds, kept_steps):
+    recorder, algorithm, state, folder = run
+    keep_one = dataclasses.replace(recorder.config.checkpoint, keep=1)
+    config = dataclasses.replace(recorder.config, checkpoint=keep_one)
+    recorder = Recorder(config, make_task(config), algorithm, folder, Processes(), seeds)
+    for env_steps in (4, 8):
+        recorder.save(state, env_steps, wall_seconds=1.0)
+    recorder.wait()
+    assert [int(path.name) for path in checkpoint.list_steps(folder.checkpoints)] == kept_steps
 
 
 ROW = {"env_steps": 4, "wall_seconds": 1.0}
