@@ -82,8 +82,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         self.dt = self.model.opt.timestep * options.frame_skip
         self.kept_arrays = self.info_arrays() if keep_info else ()
         derived = tuple(dict.fromkeys((*self.derived_names(), *self.kept_arrays)))
-        models.check_pose(self.model, derived)
         self.engine = make_engine(resolve_engine(physics), self.model, options.frame_skip, derived)
+        models.check_pose(self.model, derived)
         low, high = self.model.actuator_ctrlrange.T
         self.action_low, self.action_high = jnp.float32(low), jnp.float32(high)
         self.action_size = self.model.nu

@@ -188,7 +188,8 @@ def start_job(job: list[PlannedRun], log: Path, device: int | None, share: int, 
     is_resumed = first.steps_saved is not None
     for run in job:
         if not is_resumed and run.folder.is_run:
-            shutil.rmtree(run.folder.path)  # it ended before its first checkpoint
+            with locked(run.folder.lock, f"{run.folder.path} is in use by another training; wait for it, or stop it"):
+                shutil.rmtree(run.folder.path)  # it ended before its first checkpoint
     env = only_device(device) if device is not None else {}
     if share > 1 and "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:
         env["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{_MEMORY_FRACTION / share:.2f}"

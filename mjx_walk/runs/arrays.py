@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import tensorstore
 
-from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.errors import UserError, failed_read
 from mjx_walk.utils.files import write_text
 
 __all__ = ["HostArrays", "read_arrays", "write_arrays"]
@@ -135,14 +135,17 @@ def read_arrays(path: Path, expected: Mapping[str, Any], present_name: Callable[
         present_name: maps a stored name to the present one.
 
     Raises:
-        UserError: an array has another shape or dtype than the expected one.
+        UserError: an array has another shape or dtype than the expected one, or a file cannot be read now.
         ValueError: the folder is damaged.
     """
     read = _read_numpy if (path / _NUMPY).exists() else _read_orbax
     try:
-        return read(path, expected, present_name)
+        with _as_os_error(path):
+            return read(path, expected, present_name)
     except (UserError, MemoryError):
         raise
+    except OSError as error:
+        raise failed_read(path, error) from error
     except Exception as error:  # archives report damage with many exception types
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise ValueError(f"{path} is damaged: {reason}") from error

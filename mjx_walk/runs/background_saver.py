@@ -21,16 +21,19 @@ class Part(NamedTuple):
 class BackgroundSaver:
     """Writes checkpoints in the background, one at a time. Training waits only for the copy to the host."""
 
-    def __init__(self, folder: Path, keep: int, config: str | None = None):
+    def __init__(self, folder: Path, keep: int, config: str | None = None, prune_first: bool = False):
         """
         Args:
             folder: folder of the checkpoints.
             keep: number of newest checkpoints to keep.
             config: text of the configuration, of which each checkpoint holds a copy.
+            prune_first: remove old checkpoints and replay buffers before a save rather than after it. Until then, the
+                folder can go back by one checkpoint. `prune` removes the rest at the end.
         """
         self._folder = folder
         self._keep = keep
         self._config = config
+        self._prune_first = prune_first
         self._executor = futures.ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._running: futures.Future[None] | None = None
 
@@ -52,8 +55,19 @@ class BackgroundSaver:
             self._running = None
             running.result()
 
+    def prune(self) -> None:
+        """Remove old checkpoints and replay buffers."""
+        checkpoint.prune(self._folder, self._keep)
+
     def _save(self, parts: Iterable[Part]) -> None:
-        steps = [part.path.name for part in parts if part.path.name.isdigit()]
+        steps = [int(part.path.name) for part in parts if part.path.name.isdigit()]
+        if self._prune_first and steps:
+            checkpoint.discard_from(self._folder, steps[0])
+            checkpoint.prune(self._folder, self._keep)
         for part in parts:
             checkpoint.save(*part, config=self._config)
-        checkpoint.prune(self._folder, self._keep, max(steps, default=None))
+        if self._prune_first:
+            return
+        if steps:
+            checkpoint.discard_from(self._folder, steps[0] + 1)
+        self.prune()

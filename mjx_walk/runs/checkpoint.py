@@ -17,7 +17,7 @@ import numpy as np
 from mjx_walk.runs.arrays import HostArrays, read_arrays, write_arrays
 from mjx_walk.runs.facts import FORMAT, read_facts, write_facts
 from mjx_walk.runs.scores import POLICIES
-from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.errors import UnreadableError, UserError, failed_read
 from mjx_walk.utils.files import write_text
 from mjx_walk.utils.folders import discard, find_written, remove_unfinished, replacing_folder
 from mjx_walk.utils.versions import __version__
@@ -92,7 +92,7 @@ def config_copy(path: Path) -> Path | None:
     try:
         is_damaged = zlib.crc32(copy.read_bytes()) != checksum
     except OSError as error:
-        raise ValueError(f"{path} is damaged: {copy.name}: {error.strerror}") from error
+        raise failed_read(path, error) from error
     if is_damaged:
         raise ValueError(f"{path} is damaged: {copy.name} does not match its checksum")
     return copy
@@ -188,7 +188,8 @@ def restore_newest(
         at_most: environment steps that the checkpoint may have at most.
 
     Raises:
-        UserError: there is no usable checkpoint, or the newest belongs to another run and no other one is usable.
+        UserError: there is no usable checkpoint, one cannot be read now, or the newest belongs to another run and no
+            other one is usable.
     """
     problems: list[ValueError] = []
     paths = [path for path in list_steps(folder) if at_most is None or int(path.name) <= at_most]
@@ -197,6 +198,10 @@ def restore_newest(
         try:
             found = restore(part(path), like)
             _check_steps(path, found[1])
+        except UnreadableError:
+            raise  # an older checkpoint would lose steps that are still there
+        except MemoryError as error:
+            raise UserError(f"not enough memory to read {path}; free some, then resume") from error
         except ValueError as error:
             found = None
             problems.append(error)
@@ -217,17 +222,20 @@ def _check_steps(path: Path, meta: dict[str, Any]) -> None:
         raise ValueError(f"{path} is damaged: its facts are of step {meta['env_steps']}")
 
 
-def prune(folder: Path, keep: int, newest: str | None = None) -> None:
+def discard_from(folder: Path, env_steps: int) -> None:
+    """Remove the checkpoints from a step on: the run has resumed from before them."""
+    for path in list_steps(folder):
+        if int(path.name) >= env_steps:
+            discard(path)
+
+
+def prune(folder: Path, keep: int) -> None:
     """Remove old checkpoints, old replay buffers and unfinished saves.
 
     Args:
         folder: folder of the checkpoints.
         keep: number of newest checkpoints to keep. Only the newest keeps its replay buffer.
-        newest: name of the checkpoint just saved. Later ones are removed: the run has resumed from before them.
     """
-    for path in list_steps(folder):
-        if newest and path.name > newest:
-            discard(path)
     for path in list_steps(folder)[:-keep]:
         discard(path)
     for path in list_steps(folder)[:-1]:

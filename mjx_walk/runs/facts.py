@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_walk.utils.checksums import take_checksum, with_checksum
+from mjx_walk.utils.errors import failed_read
 from mjx_walk.utils.files import write_text
 from mjx_walk.utils.versions import __version__
 
@@ -32,13 +33,16 @@ def read_facts(path: Path) -> dict[str, Any]:
         The facts. Those of another format than `FORMAT` are returned without a look at the checksum.
 
     Raises:
-        ValueError: the file cannot be read, a fact is not what it should be, or the checksum does not match.
+        UnreadableError: the file cannot be read now.
+        ValueError: the file is missing, a fact is not what it should be, or the checksum does not match.
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise ValueError(f"it is larger than {_MAX_BYTES:,} bytes")
         facts = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
+        raise failed_read(path.parent, error) from error
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path.parent} is damaged: {path.name}: {error}") from error
     if not isinstance(facts, dict):
         raise ValueError(f"{path} should be a JSON object, found {_shown(facts)}")

@@ -25,9 +25,6 @@ from mjx_walk.viewing.film import Filmer
 
 _log = logging.getLogger(__name__)
 
-_KEPT_TOGETHER = 2
-"""Fewest checkpoints to keep where several folders are saved: a kill may leave some of them one checkpoint ahead."""
-
 
 class Recorder:
     """Writes one run's folder. Processes other than the main one save only their part of the checkpoints.
@@ -61,10 +58,11 @@ class Recorder:
         self._seeds_together = seeds_together
         self._steps_per_iteration = algorithm.steps_per_iteration * processes.process_count
         self._checkpoints = device_folder(folder.checkpoints, processes.process_index)
-        keep = config.checkpoint.keep
-        if seeds_together > 1 or processes.process_count > 1:
-            keep = max(keep, _KEPT_TOGETHER)
-        self._saver = BackgroundSaver(self._checkpoints, keep, as_yaml(config))
+        # A kill may leave some of several folders one checkpoint ahead. They go back to the one before.
+        is_saved_with_others = seeds_together > 1 or processes.process_count > 1
+        self._saver = BackgroundSaver(
+            self._checkpoints, config.checkpoint.keep, as_yaml(config), prune_first=is_saved_with_others
+        )
         self._best_iteration = -1
         self._restored_facts: Mapping[str, Any] = {}
         self._writer: MetricsWriter | None = None
@@ -206,6 +204,11 @@ class Recorder:
             self._saver.wait()
         if self._filmer:
             self._filmer.wait()
+
+    def prune(self) -> None:
+        """Remove old checkpoints and replay buffers."""
+        with self._writing():
+            self._saver.prune()
 
     def close(self) -> None:
         """Finish the checkpoint that is being written, and close the logs, however training has ended."""

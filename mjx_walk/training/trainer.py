@@ -189,8 +189,10 @@ class Trainer:
         for recorder, own in zip(self.recorders, self._program.split(state), strict=True):
             evaluate = functools.partial(self._mean_return, recorder.config.seed)
             recorder.end(own, call * self.steps_per_call, None if is_stopped else evaluate)
-            if is_stopped:
-                recorder.wait()
+        if is_stopped or self._are_saved_together:
+            self._wait_for_saves()
+            for recorder in self.recorders:
+                recorder.prune()
 
     def _mean_return(self, seed: int, policy_params: Any) -> float:
         """Mean return of a policy over as many new episodes as an inline evaluation has."""
@@ -239,10 +241,22 @@ class Trainer:
 
     def _save(self, state: TrainState, call: int) -> None:
         """Save the TrainState of every run that is finite."""
+        if self._are_saved_together:
+            self._wait_for_saves()  # only then is the checkpoint before this one not needed any more
         states = zip(self.recorders, self._program.split(state), self._program.is_finite(state), strict=True)
         for recorder, own, is_finite in states:
             if is_finite:
                 recorder.save(own, call * self.steps_per_call, self._seconds())
+
+    @property
+    def _are_saved_together(self) -> bool:
+        """Whether a checkpoint is saved in several folders."""
+        return len(self.recorders) > 1 or self._processes.process_count > 1
+
+    def _wait_for_saves(self) -> None:
+        for recorder in self.recorders:
+            recorder.wait()
+        self._processes.wait_for_all()
 
     def _nonfinite(self, state: TrainState) -> str:
         """The first learned leaf that is not finite, and its seed, for each run that has one."""

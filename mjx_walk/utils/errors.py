@@ -1,5 +1,31 @@
-"""The exception for errors that the user can correct."""
+"""The exceptions for errors that the user can correct."""
+
+import errno
+from pathlib import Path
+
+_IS_DAMAGE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, None)
 
 
 class UserError(ValueError):
     """Invalid input. Commands print its one-line message without a traceback and exit with code 2."""
+
+
+class UnreadableError(UserError):
+    """A file that may be whole, but that cannot be read now."""
+
+
+def failed_read(folder: Path, error: OSError) -> ValueError:
+    """The error for a saved folder of which a file could not be read.
+
+    Args:
+        folder: the folder.
+        error: what the system says.
+
+    Returns:
+        `UnreadableError` if permissions or a failing disk are the cause. Else the folder is damaged.
+    """
+    reason = error.strerror or str(error)
+    if error.errno in _IS_DAMAGE:
+        name = f"{Path(error.filename).name}: " if error.filename else ""
+        return ValueError(f"{folder} is damaged: {name}{reason}")
+    return UnreadableError(f"cannot read {error.filename or folder}: {reason}; once it can be read, try again")

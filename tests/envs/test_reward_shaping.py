@@ -117,17 +117,15 @@ def test_policy_trained_on_a_custom_reward_is_scored_by_gymnasium(custom, tmp_pa
 
 
 def test_a_run_folder_alone_runs_no_code(tmp_path, monkeypatch, capsys):
-    """As a stranger's folder: it brings the file that its configuration names."""
+    """As a stranger's folder whose configuration names a file with code."""
     monkeypatch.chdir(tmp_path)
-    train_here("run", f"total_steps={TINY_CALL}", "evaluation.gymnasium_episodes=1")
-    (tmp_path / "run" / "evil.py").write_text(
+    (tmp_path / "stranger.py").write_text(
         "import pathlib\npathlib.Path('ran').touch()\ndef reward(step):\n    return step.terms\n"
     )
-    config = tmp_path / "run" / "config.yaml"
-    named = f"env.reward_function={tmp_path}/run/evil.py:reward"
-    config.write_text(
-        config.read_text().replace("reward_function: null", named.removeprefix("env.").replace("=", ": "))
-    )
+    named = f"env.reward_function={tmp_path}/stranger.py:reward"
+    train_here("run", f"total_steps={TINY_CALL}", "evaluation.gymnasium_episodes=1", named)
+    (tmp_path / "ran").unlink()
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "another_user"))
     for command, *arguments in (
         ("eval", "run=run", "episodes=1"),
         ("eval", "run=run", "episodes=1", "backend=sim"),

@@ -3,14 +3,16 @@
 import errno
 import json
 import shutil
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import flip_a_byte
 
-from mjx_walk.runs import checkpoint
+from mjx_walk.runs import arrays, checkpoint
 from mjx_walk.runs.arrays import _as_os_error
+from mjx_walk.runs.background_saver import BackgroundSaver, Part
 from mjx_walk.runs.facts import read_facts, write_facts
 from mjx_walk.utils.errors import UserError
 
@@ -63,6 +65,43 @@ def test_only_the_newest_are_kept(tmp_path):
         checkpoint.save(checkpoint.step_path(tmp_path, steps), TREE, {"env_steps": steps})
     checkpoint.prune(tmp_path, 2)
     assert [int(p.name) for p in checkpoint.list_steps(tmp_path)] == [20, 100]
+
+
+def test_of_folders_saved_together_each_can_go_back_until_all_are_saved(tmp_path):
+    saver = BackgroundSaver(tmp_path, keep=1, prune_first=True)
+    state = {"a": jnp.ones(2), "replay": {"b": jnp.ones(3)}}
+    for steps, kept in ((10, [10]), (20, [10, 20]), (20, [10, 20]), (30, [20, 30])):
+        saver.save(Part(checkpoint.step_path(tmp_path, steps), state, {"env_steps": steps}))
+        saver.wait()
+        saved = checkpoint.list_steps(tmp_path)
+        assert [int(path.name) for path in saved] == kept and all((path / "replay").is_dir() for path in saved)
+    saver.prune()
+    assert [int(path.name) for path in checkpoint.list_steps(tmp_path)] == [30]
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (
+            PermissionError(errno.EACCES, "Permission denied"),
+            "cannot read .*20.*: Permission denied; once it can be read",
+        ),
+        (OSError(errno.ESTALE, "Stale file handle"), "cannot read .*20.*: Stale file handle; once it can be read"),
+        (MemoryError(), "not enough memory to read .*20; free some"),
+    ],
+)
+@pytest.mark.parametrize("reader", ["Path.read_text", "arrays._read_numpy"])
+def test_what_cannot_be_read_now_is_not_passed_over(tmp_path, monkeypatch, error, says, reader):
+    for steps in (10, 20):
+        path = checkpoint.step_path(tmp_path, steps)
+        checkpoint.save(path, {"a": jnp.ones(2)}, {"env_steps": steps}, as_numpy=True)
+
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(Path if reader.startswith("Path") else arrays, reader.partition(".")[2], fail)
+    with pytest.raises(UserError, match=says):
+        checkpoint.restore_newest(tmp_path, {"a": jnp.ones(2)})
 
 
 def test_another_shape_or_version_is_named(tmp_path):
