@@ -1,23 +1,17 @@
-"""Loggers for the rows of a run: `metrics.jsonl`, TensorBoard, Weights & Biases, the terminal."""
+"""Loggers for the rows of a run: `metrics.jsonl`, TensorBoard, Weights & Biases."""
 
-import contextlib
 import errno
 import importlib.util
 import json
-import logging
 import math
 import os
 import re
 import secrets
-import sys
-import time
 import warnings
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 from mjx_walk.runs.config import Config, flatten
 from mjx_walk.runs.metrics import Row, read_rows
@@ -25,13 +19,9 @@ from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.tensorboard import EventFile
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import Appender, replacing, write_text
-from mjx_walk.utils.text import format_score
 
-__all__ = ["MetricsWriter", "Progress", "WandbLog", "require_wandb"]
+__all__ = ["MetricsWriter", "WandbLog", "require_wandb"]
 
-_PROGRESS = logging.getLogger("mjx_walk.progress")
-_SECONDS_BETWEEN_LINES = 10.0
-"""Interval of progress lines outside a terminal."""
 _LOG_ROWS, _LOG_CHECKSUM = "log_rows", "log_crc32"
 
 
@@ -171,55 +161,3 @@ class WandbLog:
     def close(self) -> None:
         """Wait until all rows are uploaded or on disk."""
         self._run.finish()
-
-
-class Progress:
-    """Progress of a run as a bar in a terminal, else as log messages: speed, return, episode length, time left.
-
-    It stays silent unless the logger `mjx_walk.progress` shows information, as it does in commands.
-    """
-
-    def __init__(self, total_steps: int, done_steps: int):
-        """
-        Args:
-            total_steps: environment steps at the end of the run.
-            done_steps: environment steps at the start.
-        """
-        self._total = total_steps
-        self._is_terminal = sys.stderr.isatty() and _PROGRESS.isEnabledFor(logging.INFO)
-        self._bar = tqdm(
-            total=total_steps, initial=done_steps, unit="step", unit_scale=True, disable=not self._is_terminal
-        )
-        self._last_line = -math.inf
-        self._evaluated: float | None = None
-
-    def update(self, row: Row) -> None:
-        """Show one row."""
-        self._evaluated = row.get("eval/return", self._evaluated)
-        shown = {}
-        if row.get("episode/return") is not None:
-            shown = {"return": format_score(row["episode/return"]), "length": f"{row['episode/length']:,.0f}"}
-        if self._evaluated is not None:
-            shown["eval"] = format_score(self._evaluated)
-        if self._is_terminal:
-            self._draw(shown, int(row["env_steps"]))
-        elif "eval/return" in row or time.monotonic() - self._last_line > _SECONDS_BETWEEN_LINES:
-            self._last_line = time.monotonic()
-            left = (self._total - row["env_steps"]) / max(row["speed/steps_per_second"], 1e-9)
-            text = "  ".join(f"{name} {value}" for name, value in shown.items())
-            rate = row["speed/steps_per_second"]
-            steps, left = row["env_steps"], max(left, 0)
-            _PROGRESS.info("%s", f"{steps:>13,.0f} steps  {rate:>9,.0f}/s  {text}  {left:,.0f} s left")
-
-    def _draw(self, shown: dict[str, str], env_steps: int) -> None:
-        """Move the bar. A terminal that has closed shows no more of it, and the training continues."""
-        try:
-            self._bar.set_postfix(shown, refresh=False)
-            self._bar.update(env_steps - self._bar.n)
-        except OSError:
-            self._bar.disable = True
-
-    def close(self) -> None:
-        """Leave the bar as it is."""
-        with contextlib.suppress(OSError):
-            self._bar.close()

@@ -5,8 +5,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mjx_walk.runs.scores import Scores
+from mjx_walk.utils.text import duration
 
-__all__ = ["duration", "end_lines", "score_lines"]
+__all__ = ["end_lines", "score_lines"]
 
 
 def score_lines(
@@ -42,13 +43,3 @@ def end_lines(folders: list[Path], training_seconds: float, total_seconds: float
         "To watch the best policy: python -m mjx_walk.play" if is_scored else "To score: python -m mjx_walk.eval"
     )
     return [f"Finished in {time}. The results are in {where}", f"{next_step} {shlex.quote(f'run={folders[0]}')}"]
-
-
-def duration(seconds: float) -> str:
-    """Seconds as text: `48 s`, `4 min 41 s`, `1 h 2 min`."""
-    total = round(seconds)
-    if total < 60:
-        return f"{total} s"
-    if total < 3600:
-        return f"{total // 60} min {total % 60} s"
-    return f"{total // 3600} h {total % 3600 // 60} min"

@@ -18,8 +18,8 @@ from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
 from mjx_walk.envs.vector_env import check_resets
 from mjx_walk.runs.config import Config
-from mjx_walk.runs.loggers import Progress
 from mjx_walk.runs.metrics import Row, name_metrics, physics_warnings
+from mjx_walk.runs.progress import Progress
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.training.call_profile import CallProfile
 from mjx_walk.training.distributed import Processes, make_devices_program, per_device
@@ -86,6 +86,7 @@ class Trainer:
         self._on_metrics = on_metrics or (lambda row: None)
         self._started = time.monotonic()
         self._times: collections.deque[tuple[float, int]] = collections.deque()
+        self._is_compiled = False
         self._seconds_before = 0.0
         self._warned_of: set[str] = set()
 
@@ -108,7 +109,10 @@ class Trainer:
             UserError: training has diverged, so that a network, an optimizer or a running statistic is not finite.
         """
         state, call = self._start()
-        progress = Progress(self.num_calls * self.steps_per_call, call * self.steps_per_call)
+        self._say_total(call)
+        progress = Progress(
+            self.num_calls * self.steps_per_call, call * self.steps_per_call, self._processes.is_main_process
+        )
         saved_call = call or -1
         self._times.append((time.monotonic(), call))
         for recorder in self.recorders:
@@ -139,6 +143,16 @@ class Trainer:
             )
         return signal_name
 
+    def _say_total(self, call: int) -> None:
+        """Log whether the run is finished already, and the steps that it really trains."""
+        total, steps = self.config.total_steps, self.num_calls * self.steps_per_call
+        if not self._processes.is_main_process:
+            return
+        if call >= self.num_calls:
+            _log.info(f"The run has all of its {steps:,} steps already; to train on, give a larger total_steps")
+        elif steps != total:
+            _log.info(f"total_steps={total:,} becomes {steps:,}: a call has {self.steps_per_call:,} steps")
+
     def score(self) -> None:
         """Score every run in the real Gymnasium with `Recorder.score`, and log the last lines of the training.
 
@@ -149,7 +163,7 @@ class Trainer:
         is_main = self._processes.is_main_process
         if num_episodes and is_main:
             where = "Gymnasium, on the CPU" if self._task.is_in_gymnasium else f"physics={self._task.engine.name}"
-            _log.info("Scoring %d episodes of each policy in %s", num_episodes, where)
+            _log.info("Scoring each policy in %s, number of episodes: %d", where, num_episodes)
         try:
             for recorder in self.recorders:
                 seed = recorder.config.seed if len(self.recorders) > 1 else None
@@ -218,8 +232,7 @@ class Trainer:
             for recorder, row, policy in zip(self.recorders, rows, self._program.policies(state), strict=True):
                 if "eval/return" in row:
                     recorder.film(policy, int(row["env_steps"]))
-        if self._processes.is_main_process:
-            progress.update(_mean_row(rows))
+        progress.update(_mean_row(rows))
 
     def _warn_of_physics(self, row: Row) -> None:
         for metric, warning in physics_warnings(row, self.steps_per_call).items():
@@ -233,6 +246,9 @@ class Trainer:
         while len(self._times) > 1 and now - self._times[1][0] > _SPEED_WINDOW:
             self._times.popleft()
         then, call_then = self._times[0]
+        if not self._is_compiled:
+            self._times.clear()  # the speeds of later calls leave compiling out
+            self._is_compiled = True
         self._times.append((now, call))
         return (call - call_then) * self.steps_per_call / max(now - then, 1e-9)
 

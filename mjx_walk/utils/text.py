@@ -1,8 +1,8 @@
-"""Numbers as people read them."""
+"""Numbers and times as people read them."""
 
 from typing import SupportsFloat
 
-__all__ = ["format_score"]
+__all__ = ["duration", "format_score"]
 
 
 def format_score(value: SupportsFloat | None) -> str:
@@ -12,3 +12,13 @@ def format_score(value: SupportsFloat | None) -> str:
     number = float(value)
     size = abs(number)
     return f"{number:,.{0 if size >= 1000 else 1 if size >= 10 else 2}f}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds as text: `48 s`, `4 min 41 s`, `1 h 2 min`."""
+    total = round(seconds)
+    if total < 60:
+        return f"{total} s"
+    if total < 3600:
+        return f"{total // 60} min {total % 60} s"
+    return f"{total // 3600} h {total % 3600 // 60} min"
