@@ -75,7 +75,6 @@ def main(arguments: list[str]) -> int:
     if any(argument in ("-h", "--help") for argument in arguments):
         print(_help(arguments))
         return 0
-    cli.refuse_flags(_without_hydras(arguments), key_of_value)
     if any(argument.startswith("-") for argument in arguments):
         _through_hydra(arguments)
         return 0
@@ -143,6 +142,7 @@ def _through_hydra(arguments: list[str]) -> None:
     Raises:
         UserError: Hydra refuses the arguments.
     """
+    cli.refuse_flags(_without_hydras(arguments), key_of_value)
     given = [a for a in arguments if not a.startswith("-") and ("=" in a or a.startswith(("+", "~")))]
     flags = [argument for argument in arguments if argument not in given]
     overrides = complete_overrides(given, is_sweep=bool({"-m", "--multirun"} & {*flags}))

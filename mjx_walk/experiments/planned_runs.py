@@ -20,6 +20,7 @@ from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config, load_config
 from mjx_walk.runs.metrics import read_rows
 from mjx_walk.runs.overrides import complete_overrides, sweep_choices
+from mjx_walk.runs.preparation import locked_folder
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.saved_config import differences, in_short, read_saved_config
 from mjx_walk.utils.devices import only_device
@@ -188,7 +189,7 @@ def start_job(job: list[PlannedRun], log: Path, device: int | None, share: int, 
     is_resumed = first.steps_saved is not None
     for run in job:
         if not is_resumed and run.folder.is_run:
-            with locked(run.folder.lock, f"{run.folder.path} is in use by another training; wait for it, or stop it"):
+            with locked_folder(run.folder):
                 shutil.rmtree(run.folder.path)  # it ended before its first checkpoint
     env = only_device(device) if device is not None else {}
     if share > 1 and "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:

@@ -63,11 +63,10 @@ class BackgroundSaver:
         steps = [int(part.path.name) for part in parts if part.path.name.isdigit()]
         if self._prune_first and steps:
             checkpoint.discard_from(self._folder, steps[0])
-            checkpoint.prune(self._folder, self._keep)
+            self.prune()
         for part in parts:
             checkpoint.save(*part, config=self._config)
-        if self._prune_first:
-            return
-        if steps:
-            checkpoint.discard_from(self._folder, steps[0] + 1)
-        self.prune()
+        if not self._prune_first:
+            if steps:
+                checkpoint.discard_from(self._folder, steps[0] + 1)
+            self.prune()

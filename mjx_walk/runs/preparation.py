@@ -13,7 +13,7 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import is_unfinished, sync
 from mjx_walk.utils.locks import locked
 
-__all__ = ["prepared"]
+__all__ = ["locked_folder", "prepared"]
 
 _CANNOT_WRITE = "cannot write to run_dir={}: {}"
 
@@ -43,7 +43,7 @@ def prepared(configs: list[Config]) -> Iterator[tuple[list[RunFolder], list[Conf
     _check_all(folders, configs)
     with contextlib.ExitStack() as locks:
         for folder in folders:
-            locks.enter_context(_lock(folder))
+            locks.enter_context(locked_folder(folder))
         _check_all(folders, configs)
         for folder, config in zip(folders, configs, strict=True):
             _create(folder, config)
@@ -60,8 +60,12 @@ def _check_all(folders: list[RunFolder], configs: list[Config]) -> None:
 
 
 @contextlib.contextmanager
-def _lock(folder: RunFolder) -> Iterator[None]:
-    """Create a folder if there is none, and hold its lock until the training ends, however it ends."""
+def locked_folder(folder: RunFolder) -> Iterator[None]:
+    """Context manager that creates a folder if there is none, and holds its lock, however its process ends.
+
+    Raises:
+        UserError: another training holds the lock, or the folder cannot be written.
+    """
     with contextlib.ExitStack() as held:
         try:
             folder.path.mkdir(parents=True, exist_ok=True)

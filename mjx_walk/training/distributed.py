@@ -119,7 +119,7 @@ def _init_on_device(algorithm: Algorithm, process_index: int, key: jax.Array) ->
 def _make_step(algorithm: Algorithm, processes: Processes, iterations_per_call: int) -> Step:
     """Like `programs.make_step`, with metrics over all devices.
 
-    Nothing is allocated in a call after its first iteration, so that the memory of physics does not move.
+    The results of an iteration take the memory of the one before, so that the arrays of physics do not move.
     """
     devices = sorted(jax.devices(), key=lambda device: device.process_index)
     sharding = NamedSharding(Mesh(np.array(devices), (DEVICES,)), PartitionSpec(DEVICES))
