@@ -55,7 +55,7 @@ def test_a_command_gets_its_arguments(monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("command", "says"),
     [
-        ("trian", "did you mean: train?"),
+        ("trai", "did you mean: train?"),
         ("env=humanoid", "did you mean: train env=humanoid?"),
         ("fly", "choose one of: train, eval, play, plots, export, zoo, compare, bench, parity"),
     ],
