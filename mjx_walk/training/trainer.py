@@ -163,7 +163,8 @@ class Trainer:
         is_main = self._processes.is_main_process
         if num_episodes and is_main:
             where = "Gymnasium, on the CPU" if self._task.is_in_gymnasium else f"physics={self._task.engine.name}"
-            _log.info("Scoring each policy in %s (episodes: %d)", where, num_episodes)
+            episodes = "episode" if num_episodes == 1 else "episodes"
+            _log.info("Scoring %d %s of each policy in %s", num_episodes, episodes, where)
         try:
             for recorder in self.recorders:
                 seed = recorder.config.seed if len(self.recorders) > 1 else None
