@@ -6,12 +6,15 @@ import flax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs.physics import PhysicsState
 
 NO_TIME_LIMIT = 2**31 - 1
 """Value of `max_episode_steps` when a caller or a wrapper applies the time limit."""
+
+MAX_ABS_VALUE = 1e10
+"""Largest valid position or velocity, as in MuJoCo's own check (`mjMAXVAL`)."""
 
 Carry = dict[str, Array]
 """Quantities of one step that the next step's reward needs, in addition to the physics state."""
@@ -45,6 +48,11 @@ def check_action_shape(action: Any, expected: tuple[int, ...]) -> None:
     """
     if np.shape(action) != expected:
         raise ValueError(f"Action dimension mismatch. Expected {expected}, found {np.shape(action)}")
+
+
+def is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[Array, ""]:
+    """Whether all elements are below `limit` in absolute value; NaN never is."""
+    return jnp.array([jnp.all(jnp.abs(x) < limit) for x in arrays]).all()
 
 
 class TrainableTask(Protocol):

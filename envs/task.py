@@ -14,17 +14,14 @@ from mjx_walk.envs.info import GymnasiumInfo
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, shaping_terms, term_names
-from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape
+from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape, is_finite
 from mjx_walk.envs.task_options import TaskOptions, check_version
 from mjx_walk.envs.user_files import load_reward_function
 from mjx_walk.envs.view import View
 from mjx_walk.utils.compat import standard_dtypes
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["MAX_ABS_VALUE", "Task"]
-
-MAX_ABS_VALUE = 1e10
-"""Largest valid position or velocity, as in MuJoCo's own check (`mjMAXVAL`)."""
+__all__ = ["Task"]
 
 
 class Task(GymnasiumInfo, TrainableTask, abc.ABC):
@@ -116,10 +113,15 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         """Whether Gymnasium has an equivalent environment. A subclass does not inherit it."""
         return "GYMNASIUM_NAME" in vars(type(self))
 
+    @classmethod
+    def id_of(cls, options: TaskOptions) -> str:
+        """Id of the equivalent environment in Gymnasium; without one, the task's name."""
+        return f"{cls.GYMNASIUM_NAME}-{options.version}" if "GYMNASIUM_NAME" in vars(cls) else options.name
+
     @property
     def gymnasium_id(self) -> str:
-        """Id of the equivalent environment in Gymnasium; without one, the task's name."""
-        return f"{self.GYMNASIUM_NAME}-{self.options.version}" if self.is_in_gymnasium else self.options.name
+        """The same, of this task."""
+        return self.id_of(self.options)
 
     def gymnasium_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of `gymnasium.make` for the equivalent environment, without those at their default."""
@@ -249,27 +251,25 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
             RewardStep(terms, reward, state.physics, physics, obs, action, terminated, self.dt)
         )
 
-        is_finite = _is_finite((physics.qpos, physics.qvel)) & _is_finite(
-            (physics.qacc_warmstart, obs, reward), jnp.inf
-        )
+        valid = is_finite((physics.qpos, physics.qvel)) & is_finite((physics.qacc_warmstart, obs, reward), jnp.inf)
         physics, carry, obs = jax.tree.map(
-            lambda new, old: jnp.where(is_finite, new, old),
+            lambda new, old: jnp.where(valid, new, old),
             (physics, carry, obs),
             (state.physics, state.memory, state.obs),
         )
         # A float32 zero: weakly typed metrics would compile every program twice.
         zero = jnp.float32(0.0)
-        terms = {name: jnp.where(is_finite, value, zero) for name, value in terms.items()}
+        terms = {name: jnp.where(valid, value, zero) for name, value in terms.items()}
         steps = state.steps + 1
         return State(
             physics=physics,
             memory=carry,
             obs=obs,
-            reward=jnp.where(is_finite, reward, zero),
-            terminated=terminated | ~is_finite,
+            reward=jnp.where(valid, reward, zero),
+            terminated=terminated | ~valid,
             truncated=steps >= self.max_episode_steps,
             steps=steps,
-            metrics=terms | {"nonfinite": jnp.float32(~is_finite), "overflow": jnp.float32(overflow)},
+            metrics=terms | {"nonfinite": jnp.float32(~valid), "overflow": jnp.float32(overflow)},
         )
 
     def _kept(self, derived: Derived) -> Carry:
@@ -294,8 +294,3 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         if self._reward_function:
             names = term_names(self._reward_function, str(self.options.reward_function), step, shaped)
         return (*names, *shaped)
-
-
-def _is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[Array, ""]:
-    """Whether all elements are below `limit` in absolute value; NaN never is."""
-    return jnp.array([jnp.all(jnp.abs(x) < limit) for x in arrays]).all()

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_walk.envs.inline_evaluation import InlineEvaluation, InlineEvaluator
-from mjx_walk.envs.state import State
-from mjx_walk.envs.task import MAX_ABS_VALUE, Task
+from mjx_walk.envs.state import MAX_ABS_VALUE, State
+from mjx_walk.envs.task import Task
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import Metric, Metrics, Reduction
 

@@ -67,8 +67,8 @@ def test_gait_sheet(tmp_path):
     image = iio.imread(tmp_path / "gait.png")
     assert image.shape[0] > 1000 and image.std() > 20
     strip = iio.imread(tmp_path / "strip.png")
-    assert strip.shape == (180, 8 * 80, 3)
-    first, last = strip[:, :80].astype(float), strip[:, -80:].astype(float)
+    assert strip.shape == (180, 8 * 120, 3)
+    first, last = strip[:, :120].astype(float), strip[:, -120:].astype(float)
     assert np.abs(first - last).mean() > 5
     assert not list(tmp_path.glob("*.mp4"))
 
@@ -78,7 +78,7 @@ def test_play_prints_a_one_line_error(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     (tmp_path / "file").write_text("")
     for arguments, message in (
-        ((), "say which run: run=RUN_DIR, or one of run=zoo:humanoid-csac, "),
+        ((), "say which run: run=RUN_DIR or run=zoo:NAME; python -m mjx_walk.zoo lists the names"),
         (("run=nowhere",), "no run at 'nowhere'"),
         (("run=zoo:walker2d-sac", f"out={tmp_path}/file/walk.mp4"), f"cannot write {tmp_path}/file/walk.mp4"),
         (("run=zoo:walker2d-sac", f"html={tmp_path}/file/walk.html"), f"cannot write {tmp_path}/file/walk.html"),

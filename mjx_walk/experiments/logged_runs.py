@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
+from mjx_walk.envs import TASKS
 from mjx_walk.runs.config import Config, flatten
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.run_folder import RunFolder, open_existing
@@ -33,8 +34,8 @@ class LoggedRun:
 
     @property
     def task(self) -> str:
-        """Environment and version, in words."""
-        return f"{self.config.env.name} {self.config.env.version}"
+        """Gymnasium's id of the environment, or the name of the user's own task."""
+        return TASKS[self.config.env.name][0].id_of(self.config.env)
 
     @property
     def is_standard(self) -> bool:

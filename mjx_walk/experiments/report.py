@@ -13,8 +13,12 @@ from mjx_walk.runs.metrics import write_csv
 from mjx_walk.runs.scores import BEST, FINAL
 from mjx_walk.utils.files import replacing, write_text
 from mjx_walk.utils.text import format_score
-from mjx_walk.viewing.run_plots import learning_axes, series
+from mjx_walk.viewing.run_plots import evaluations, learning_axes, series
 
+DRAWN = (
+    "Lines: with exploration noise, each seed thin, their mean bold. Dots: evaluations without noise. "
+    "Stars: final policies in Gymnasium."
+)
 LEGEND = (
     "Scores are mean returns in Gymnasium. The final policy is the newest one. The best policy has the highest "
     "evaluation during training. For files of older versions, it is the better of both on the scored episodes.\n"
@@ -42,7 +46,7 @@ def write_comparison(folder: Path, groups: dict[str, list[LoggedRun]]) -> Path:
 
 
 def draw_curves(axes: Axes, groups: dict[str, list[LoggedRun]], quantity: str, key: str, unit: float) -> None:
-    """Draw every run thin, the mean of its group bold, and its interval.
+    """Draw every run thin, the mean of its group bold, and its interval. Dots and stars are of single runs.
 
     Args:
         axes: where to draw.
@@ -59,6 +63,12 @@ def draw_curves(axes: Axes, groups: dict[str, list[LoggedRun]], quantity: str, k
         color = f"C{number % 10}"
         for curve in curves:
             axes.plot(*curve, color=color, alpha=0.35, linewidth=0.8)
+        for run in runs:
+            x, y = evaluations(run.rows, key, quantity)
+            axes.plot(x / unit, y, "o", color=color, markersize=5, markeredgecolor="white", markeredgewidth=0.7)
+            if quantity == "return" and run.score(FINAL):
+                end = (run.rows[-1][key] / unit, run.score(FINAL)["mean"])
+                axes.plot(*end, "*", color=color, markersize=12, markeredgecolor="white", markeredgewidth=0.7, zorder=3)
         x, mean, values = mean_curve(curves)
         axes.plot(x, mean, color=color, linewidth=2.2, label=f"{name} ({len(curves)})".replace("$", r"\$"))
         bounds = interval(values)
@@ -71,7 +81,7 @@ def _draw(groups: dict[str, list[LoggedRun]], path: Path) -> None:
     for axes, quantity, key, unit in learning_axes(figure):
         draw_curves(axes, groups, quantity, key, unit)
     task = next(iter(groups.values()))[0].task
-    figure.suptitle(f"{task}, during training: each seed thin, their mean bold")
+    figure.suptitle(f"{task}. {DRAWN}")
     handles, labels = figure.axes[0].get_legend_handles_labels()
     if handles:
         num_columns = max(160 // (len(max(labels, key=len)) + 8), 1)  # as many as fit the figure's width

@@ -12,28 +12,29 @@ from mjx_walk.envs import BUILT_IN_TASKS
 from mjx_walk.experiments import planned_runs
 from mjx_walk.experiments.logged_runs import LoggedRun, group, interval, read_runs
 from mjx_walk.experiments.planned_runs import PlannedRun
-from mjx_walk.experiments.report import LEGEND, csv_row, draw_curves, run_cells, table, write_comparison
+from mjx_walk.experiments.report import DRAWN, LEGEND, csv_row, draw_curves, run_cells, table, write_comparison
 from mjx_walk.runs.metrics import write_csv
 from mjx_walk.runs.scores import BEST, FINAL
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import replacing, user_path, write_text
 from mjx_walk.utils.text import format_score
+from mjx_walk.viewing.run_plots import THOUSANDS
 
 SUITES = {"mujoco": tuple(BUILT_IN_TASKS)}
 """Environments of each suite."""
 
 REFERENCES = {
-    "humanoid v5": (110, 2_661),
-    "humanoid_standup v5": (33_501, 150_913),
-    "walker2d v5": (1.93, 4_390),
-    "ant v5": (-78.2, 4_943),
-    "half_cheetah v5": (-281, 9_815),
-    "hopper v5": (17.0, 1_654),
-    "swimmer v5": (3.16, 301),
-    "reacher v5": (-42.9, -5.03),
-    "pusher v5": (-148, -37.1),
-    "inverted_pendulum v5": (5.63, 950),
-    "inverted_double_pendulum v5": (50.1, 9_033),
+    "Humanoid-v5": (110, 2_661),
+    "HumanoidStandup-v5": (33_501, 150_913),
+    "Walker2d-v5": (1.93, 4_390),
+    "Ant-v5": (-78.2, 4_943),
+    "HalfCheetah-v5": (-281, 9_815),
+    "Hopper-v5": (17.0, 1_654),
+    "Swimmer-v5": (3.16, 301),
+    "Reacher-v5": (-42.9, -5.03),
+    "Pusher-v5": (-148, -37.1),
+    "InvertedPendulum-v5": (5.63, 950),
+    "InvertedDoublePendulum-v5": (50.1, 9_033),
 }
 """For each environment, the score of uniformly random actions over 100 episodes, and the highest mean of four seeds
 that SLM-Lab 5 has published for PPO, SAC and CrossQ on the same environment: an average during training."""
@@ -180,13 +181,14 @@ def _draw(tasks: Tasks, path: Path) -> None:
         draw_curves(axes, groups, "return", "env_steps", 1e6)
         if task in REFERENCES:
             axes.axhline(REFERENCES[task][1], color="0.4", linewidth=1, linestyle=":", label="reference")
-        axes.set_title(task, fontsize=10)
+        axes.set_title(task, fontsize=10, parse_math=False)
+        axes.yaxis.set_major_formatter(THOUSANDS)
         axes.grid(alpha=0.3)
     for axes in panels[len(tasks) :]:
         axes.axis("off")
     for axes in panels[: len(tasks)][-_COLUMNS:]:
         axes.set_xlabel("million environment steps")
-    figure.suptitle("Return during training: each seed thin, their mean bold")
+    figure.suptitle(f"Returns. {DRAWN}", fontsize=11)
     handles = {
         label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }

@@ -6,6 +6,7 @@ import matplotlib.figure
 import mujoco
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.gridspec import SubplotSpec
 
 from mjx_walk.utils.files import replacing
 from mjx_walk.utils.text import format_score
@@ -24,26 +25,27 @@ def draw_gait_sheet(episode: Episode, path: Path) -> Path:
 
     The details are frames over a second, and floor contacts, motors and reward terms over three seconds.
     """
-    figure = matplotlib.figure.Figure(figsize=(12, 13), layout="constrained")
-    grid = figure.add_gridspec(5, 2, height_ratios=[1.3, 1, 1, 1.2, 1.2])
+    figure = matplotlib.figure.Figure(figsize=(12, 15), layout="constrained")
+    grid = figure.add_gridspec(6, 1, height_ratios=[1.3, 1, 1, 0.8, 1.4, 1])
     num_detail_steps = round(_DETAIL_SECONDS / episode.seconds_per_step)
     start = max(0, (len(episode.rewards) - 1 - num_detail_steps) // 2)
     shown = slice(start, start + num_detail_steps)
     length = f"{len(episode.rewards)} steps ({episode.seconds[-1]:.1f} s)"
     figure.suptitle(f"{episode.env}: return {format_score(episode.rewards.sum())} in {length}")
-    _frames(figure.add_subplot(grid[0, :]), episode, float(episode.seconds[start]))
-    height = figure.add_subplot(grid[1, :])
+    _frames(figure.add_subplot(grid[0]), episode, float(episode.seconds[start]))
+    height = figure.add_subplot(grid[1])
     moves_in_plane = np.ptp(episode.body[:, 2]) < _NO_HEIGHT
     height.plot(episode.seconds, episode.body[:, 1 if moves_in_plane else 2])
     height.set_ylabel(f"{episode.body_name} {'y' if moves_in_plane else 'height'} (m)")
-    speed = figure.add_subplot(grid[2, :], sharex=height)
+    speed = figure.add_subplot(grid[2], sharex=height)
     speed.plot(episode.seconds[1:], np.diff(episode.body[:, 0]) / episode.seconds_per_step)
     speed.set_ylabel(f"{episode.body_name} speed along x (m/s)")
     speed.set_xlabel("seconds")
-    _contacts(figure.add_subplot(grid[3, :]), episode, shown)
-    forces = dict(zip(_motor_names(episode.model), episode.motor_forces.T, strict=True))
-    _lines(figure.add_subplot(grid[4, 0]), episode, shown, forces, "motor torque (N·m) or force (N)")
-    _lines(figure.add_subplot(grid[4, 1]), episode, shown, episode.reward_terms, "reward term per step")
+    _contacts(figure.add_subplot(grid[3]), episode, shown)
+    _motors(grid[4], episode, shown)
+    terms = figure.add_subplot(grid[5])
+    _lines(terms, episode, shown, episode.reward_terms)
+    terms.set_ylabel("reward term per step")
     for axes in figure.axes[1:]:
         axes.grid(alpha=0.3)
     with replacing(path) as new:
@@ -60,12 +62,12 @@ def frame_strip(episode: Episode, start: float, seconds: float) -> np.ndarray:
         seconds: length of the part.
 
     Returns:
-        `[height, 8·(width // 3), 3] u8`: the middle third of each frame.
+        `[height, 8·(width // 2), 3] u8`: the middle half of each frame.
     """
     times = np.linspace(start, start + seconds, _NUM_FRAMES) * episode.frames_per_second
     chosen = [episode.frames[min(int(time), len(episode.frames) - 1)] for time in times]
-    width = chosen[0].shape[1] // 3
-    return np.concatenate([frame[:, width : 2 * width] for frame in chosen], axis=1)
+    width = chosen[0].shape[1] // 2
+    return np.concatenate([frame[:, width // 2 : width // 2 + width] for frame in chosen], axis=1)
 
 
 def _frames(axes: Axes, episode: Episode, start: float) -> None:
@@ -84,21 +86,48 @@ def _contacts(axes: Axes, episode: Episode, shown: slice) -> None:
     for line, body in enumerate(bodies):
         touching = episode.floor_contacts[shown, body]
         axes.broken_barh([(t, episode.seconds_per_step) for t in edges[touching]], (line - 0.4, 0.8))
-    axes.set_yticks(range(len(bodies)), [episode.model.body(body).name for body in bodies])
+    axes.set_yticks(range(len(bodies)), [_body_name(episode.model, body) for body in bodies])
     axes.set_xlim(edges[0], edges[-1])
     axes.set_title("floor contacts" if bodies else "no floor contacts", fontsize=9)
 
 
-def _lines(axes: Axes, episode: Episode, shown: slice, series: dict[str, np.ndarray], ylabel: str) -> None:
+def _body_name(model: mujoco.MjModel, body: int) -> str:
+    """A body's name, or of which body it is a part."""
+    name = model.body(body).name
+    return name or f"part of {_body_name(model, int(model.body_parentid[body])).removeprefix('part of ')}"
+
+
+def _motors(place: SubplotSpec, episode: Episode, shown: slice) -> None:
+    """Draw what the motors do, a plot per limb."""
+    limbs: dict[str, dict[str, np.ndarray]] = {}
+    for motor, forces in enumerate(episode.motor_forces.T):
+        limb, name = _limb_and_name(episode.model, motor)
+        limbs.setdefault(limb, {})[name] = forces
+    plots = place.subgridspec(1, len(limbs)).subplots(sharey=True, squeeze=False)[0]
+    for axes, (limb, forces) in zip(plots, limbs.items(), strict=True):
+        axes.set_title(limb, fontsize=9)
+        _lines(axes, episode, shown, forces)
+    plots[0].set_ylabel("motor torque (N·m)\nor force (N)")
+
+
+def _lines(axes: Axes, episode: Episode, shown: slice, series: dict[str, np.ndarray]) -> None:
     """Draw one labelled line per series."""
     for name, values in series.items():
         axes.plot(episode.seconds[shown], values[shown], label=name, linewidth=1)
-    axes.legend(fontsize=6, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.18))
-    axes.set_xlabel("seconds")
-    axes.set_ylabel(ylabel)
+    axes.legend(fontsize=7, ncols=2 if axes.get_title() else 8, loc="upper center", bbox_to_anchor=(0.5, -0.22))
+    axes.set_xlabel("seconds", fontsize=8)
 
 
-def _motor_names(model: mujoco.MjModel) -> list[str]:
-    """Names of the motors; a motor without one takes the name of its joint."""
-    motors = (model.actuator(i) for i in range(model.nu))
-    return [motor.name or model.joint(int(motor.trnid[0])).name for motor in motors]
+def _limb_and_name(model: mujoco.MjModel, motor: int) -> tuple[str, str]:
+    """The limb that a motor drives and the motor's name, or without one the joint's.
+
+    A limb is named after its first body. It begins where the tree of bodies branches.
+    """
+    name = model.actuator(motor).name
+    if model.actuator_trntype[motor] != mujoco.mjtTrn.mjTRN_JOINT:
+        return "other motors", name or f"motor {motor}"
+    joint = int(model.actuator(motor).trnid[0])
+    body = int(model.jnt_bodyid[joint])
+    while (parent := int(model.body_parentid[body])) and (model.body_parentid == parent).sum() == 1:
+        body = parent
+    return _body_name(model, body), name or model.joint(joint).name

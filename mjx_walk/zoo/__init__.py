@@ -29,7 +29,7 @@ def open_run(run: str | Path | None) -> RunFolder:
         UserError: no run is given, or there is none of that path or name.
     """
     if run is None:
-        raise UserError(f"say which run: run=RUN_DIR, or one of run={PREFIX}{f', {PREFIX}'.join(names())}")
+        raise UserError(f"say which run: run=RUN_DIR or run={PREFIX}NAME; python -m mjx_walk.zoo lists the names")
     if not str(run).startswith(PREFIX):
         return open_existing(run)
     name = str(run).removeprefix(PREFIX)

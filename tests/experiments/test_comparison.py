@@ -11,6 +11,7 @@ import pytest
 from helpers import command, command_here, finish, start, wait_for_rows
 
 from mjx_walk import compare as compare_command
+from mjx_walk.envs import TASKS, make_options
 from mjx_walk.experiments import logged_runs, planned_runs, suite
 from mjx_walk.runs.config import load_config
 from mjx_walk.runs.saved_config import save_config
@@ -124,15 +125,15 @@ def test_a_score_file_of_one_block_counts_as_the_best(tmp_path):
 def test_runs_of_several_environments_are_normalized(tmp_path):
     """0 is the random score and 1 the reference, in each environment that Gymnasium scores by default."""
     for env in ("walker2d", "hopper", "ant", "reacher"):
-        random, reference = suite.REFERENCES[f"{env} v5"]
+        random, reference = suite.REFERENCES[TASKS[env][0].id_of(make_options(env))]
         for seed in range(3):
             score = random + (seed + 1) * (reference - random)
             fake_run(tmp_path / env / str(seed), [f"env={env}", f"seed={seed}"], [1, 2], score)
     fake_run(tmp_path / "ant" / "3", ["env=ant", "seed=3"], [1, 2], 5000.0)  # not scored in the others
     text = suite.write_report(tmp_path).read_text()
     assert "| ppo | final | 2.00 | -0.48 | 4.48 | 2.00 | -0.48 | 4.48 | 4 | 3 |" in text
-    assert "| reacher v5 | ppo | 32.8 | 37.9 | -61.2 | 126.9 | 42.8 | -42.9 | -5.03 | 2.00 |" in text
-    assert "| ant v5 | ppo | 3 | 5,000 | 1.00 | 5,010 |" in text
+    assert "| Reacher-v5 | ppo | 32.8 | 37.9 | -61.2 | 126.9 | 42.8 | -42.9 | -5.03 | 2.00 |" in text
+    assert "| Ant-v5 | ppo | 3 | 5,000 | 1.00 | 5,010 |" in text
     assert (tmp_path / "comparison.png").read_bytes()[:4] == b"\x89PNG"
     assert len((tmp_path / "comparison.csv").read_text().splitlines()) == 1 + 13
 

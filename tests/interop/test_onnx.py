@@ -25,7 +25,8 @@ def assert_equal(model, act, observations, dtype=np.float64):
     session = onnxruntime.InferenceSession(model.SerializeToString())
     (found,) = session.run(["action"], {"observation": observations.astype(dtype)})
     expected = np.asarray(act(np.float32(observations)))
-    assert found.shape == expected.shape and found.dtype == np.float32 and expected.std() > 0.01
+    assert found.shape == expected.shape and found.dtype == np.float32
+    assert expected.size == 1 or expected.std() > 0.01
     # For the policies in the zoo, float32 alone changes an action by up to 1.5e-5 against float64.
     np.testing.assert_allclose(found, expected, atol=4e-5)
 
@@ -99,7 +100,7 @@ def test_example_of_readme(tmp_path, capsys):
 def test_export_prints_a_one_line_error(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     for arguments, message in (
-        ((), "say which run: run=RUN_DIR, or one of run=zoo:humanoid-csac, "),
+        ((), "say which run: run=RUN_DIR or run=zoo:NAME"),
         (("run=zoo:walker2d-sac", "format=tflite"), "format=tflite"),
         (("run=zoo:walker2d-sac", f"out={tmp_path}/file/policy.onnx"), "cannot write"),
     ):
