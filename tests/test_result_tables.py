@@ -1,0 +1,42 @@
+"""The tables of scores in README.md and docs/results.md."""
+
+import importlib.util
+import re
+
+import numpy as np
+import pytest
+import scipy.stats
+from helpers import CLONE
+
+from mjx_walk.experiments.suite import REFERENCES, normalize
+
+_SPEC = importlib.util.spec_from_file_location("result_tables", CLONE / "docs" / "result_tables.py")
+tables = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(tables)
+
+
+@pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
+def test_pages_hold_the_present_tables(page):
+    text = page.read_text()
+    assert "<!-- begin " in text and tables.fill(text) == text, "run: python docs/result_tables.py"
+
+
+def test_readme_shows_the_best_algorithm_of_each_task():
+    rows = tables._read("results.csv")
+    shown = [row for row in rows if row["published_v5"]]
+    assert len(shown) == 3
+    for row in shown:
+        assert float(row["score"]) == max(float(other["score"]) for other in rows if other["task"] == row["task"])
+
+
+def test_normalized_scores_follow_from_the_table():
+    text = (CLONE / "docs" / "results.md").read_text()
+    scores = {row["id"]: row for row in tables._read("experiments.csv") if row["id"].startswith("MS")}
+    found = []
+    for suffix in ("", "@best"):
+        rows = [scores[f"MS{number}{suffix}"] for number in range(1, 12)]
+        assert [f"{row['task']}-{row['version']}" for row in rows] == list(REFERENCES)
+        values = [normalize(f"{row['task']}-{row['version']}", float(row["final_mean"])) for row in rows]
+        found += [f"{np.mean(values):.2f}", f"{scipy.stats.trim_mean(values, 0.25):.2f}"]
+    sentence = r"mean of ([\d.]+) and an interquartile mean of ([\d.]+), the best\s+ones ([\d.]+) and ([\d.]+)\."
+    assert list(re.search(sentence, text).groups()) == found
