@@ -1,16 +1,22 @@
 """Record a few calls of a training with JAX's profiler."""
 
+import logging
 from pathlib import Path
 from typing import Self
 
 import jax
+
+_log = logging.getLogger(__name__)
 
 CALLS_BEFORE = 2
 """The first call compiles the training's programs, and the programs that read its results compile after it."""
 
 
 class CallProfile:
-    """Records program calls from the third one on, and writes the recording before the next call or on exit."""
+    """Records program calls from the third one on, and writes the recording before the next call or on exit.
+
+    A recording that fails costs the training nothing: a warning says why.
+    """
 
     def __init__(self, folder: Path, num_calls: int):
         """
@@ -32,13 +38,29 @@ class CallProfile:
         if self._calls == CALLS_BEFORE + self._num_calls:
             self._stop()
         elif self._calls == CALLS_BEFORE:
-            options = jax.profiler.ProfileOptions()
-            options.python_tracer_level = 0  # it would slow the host down
-            jax.profiler.start_trace(self._folder, profiler_options=options)
-            self._is_recording = True
+            self._start()
         self._calls += 1
 
+    def _start(self) -> None:
+        options = jax.profiler.ProfileOptions()
+        options.python_tracer_level = 0  # it would slow the host down
+        try:
+            jax.profiler.start_trace(self._folder, profiler_options=options)
+            self._is_recording = True
+        except RuntimeError as error:  # the user's own program records already
+            _log.warning(f"cannot record calls: {_first_line(error)}")
+
     def _stop(self) -> None:
-        if self._is_recording:
-            self._is_recording = False
+        if not self._is_recording:
+            return
+        self._is_recording = False
+        try:
+            if not self._folder.parent.exists():
+                raise OSError("its run folder was removed")  # the profiler would make it anew
             jax.profiler.stop_trace()
+        except (OSError, RuntimeError) as error:
+            _log.warning(f"cannot write the recording of calls to {self._folder}: {_first_line(error)}")
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0]

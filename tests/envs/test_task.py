@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import gymnasium
@@ -29,6 +30,23 @@ def test_vmap_equals_separate_steps():
     for i in (0, 7, 19):
         alone = task.step(jax.tree.map(lambda x, i=i: x[i], states), actions[i])
         jax.tree.map(np.testing.assert_array_equal, alone, jax.tree.map(lambda x, i=i: x[i], together))
+
+
+def test_threads_may_step_one_task():
+    task = make_env("hopper", physics="c")
+    step = jax.jit(jax.vmap(task.step))
+    start = jax.vmap(task.reset)(jax.random.split(jax.random.PRNGKey(0), 32))  # enough for several MuJoCo threads
+
+    def roll_out(seed):
+        state = start
+        for key in jax.random.split(jax.random.PRNGKey(seed), 60):
+            state = step(state, jax.random.uniform(key, (32, 3), minval=-1, maxval=1))
+        return state
+
+    in_turn = [roll_out(seed) for seed in range(4)]
+    with ThreadPoolExecutor(4) as pool:
+        at_once = list(pool.map(roll_out, range(4)))
+    jax.tree.map(np.testing.assert_array_equal, in_turn, at_once)
 
 
 @pytest.mark.parametrize("make", [lambda: make_env("walker2d", physics="c"), MountainCar])
