@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.subprocesses import start_module
+from mjx_walk.utils.signals import as_by_ctrl_c
+from mjx_walk.utils.subprocesses import start_module, with_parent
 
 
 class Measurement(NamedTuple):
@@ -52,6 +53,8 @@ def training(
 ) -> Iterator[tuple[list[Row], Path]]:
     """Train until enough rows are logged, then send the signal. Gives the rows and the run folder, which is removed.
 
+    The training ends with this process.
+
     Args:
         overrides: as for `train`.
         are_enough: `rows → bool`.
@@ -62,12 +65,12 @@ def training(
         UserError: training rejects these settings.
         RuntimeError: training failed.
     """
-    with tempfile.TemporaryDirectory() as folder:
+    with as_by_ctrl_c(), tempfile.TemporaryDirectory() as folder:
         run_dir, output = Path(folder, "run"), Path(folder, "output.txt")
         arguments = [*overrides, "evaluation.gymnasium_episodes=0", f"run_dir={run_dir}"]
         with (
             output.open("w") as file,
-            start_module("train", *arguments, env=env, stdout=file, stderr=STDOUT) as process,
+            start_module("train", *arguments, env=with_parent() | (env or {}), stdout=file, stderr=STDOUT) as process,
         ):
             try:
                 # The process outlives its last row for a while, so this loop reads that row.

@@ -26,6 +26,7 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import check_replaceable
 from mjx_walk.utils.settings import validate
 from mjx_walk.utils.signals import Stopped, exit_code
+from mjx_walk.utils.subprocesses import end_with_parent
 from mjx_walk.utils.versions import __version__
 
 __all__ = [
@@ -190,6 +191,7 @@ def main(command: Callable[[list[str]], int | None]) -> NoReturn:
 
     Invalid input, a full or read-only disk, a path that is too long, and Ctrl-C print one line instead of a traceback.
     """
+    end_with_parent()
     with console(), standard_settings():
         exempt_imports_from_gc()
         prepare_jax()

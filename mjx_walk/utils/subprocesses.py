@@ -1,6 +1,8 @@
 """Modules of this package as child processes."""
 
+import ctypes
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +11,25 @@ from typing import Any
 PYTHON = [sys.executable, *(["-P"] if sys.flags.safe_path else [])]
 """The command of this interpreter. With `-P` it imports nothing from the working directory."""
 _ROOT = Path(__file__).parents[2]
+_ENDED_BY_PARENT = "MJX_WALK_ENDED_BY"
+"""Environment variable of a child process that must not outlive its parent: the parent's process id."""
+_PR_SET_PDEATHSIG = 1
+"""From Linux's `prctl.h`."""
+
+
+def with_parent() -> dict[str, str]:
+    """For `env` of `start_module`: the child ends when this process does, even by SIGKILL (Linux only)."""
+    return {_ENDED_BY_PARENT: str(os.getpid())}
+
+
+def end_with_parent() -> None:
+    """Receive SIGTERM when the parent ends, if it has asked for that."""
+    parent = os.environ.pop(_ENDED_BY_PARENT, None)  # for this process, not for its own children
+    if parent is None or not sys.platform.startswith("linux"):
+        return
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != int(parent):  # it has ended already
+        signal.raise_signal(signal.SIGTERM)
 
 
 def start_module(name: str, *arguments: str, env: dict[str, str] | None = None, **options: Any) -> subprocess.Popen:

@@ -1,8 +1,11 @@
 """Child processes import what their parent imports."""
 
 import os
+import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
 from helpers import CLONE
@@ -23,3 +26,34 @@ def test_a_child_of_a_safe_parent_imports_nothing_from_the_working_directory(tmp
     arguments = [sys.executable, *(["-P"] if safe else []), "-c", program]
     subprocess.run(arguments, cwd=tmp_path, env=env, stderr=subprocess.DEVNULL, check=False)
     assert (tmp_path / "ran").exists() != safe
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells a process that its parent has ended")
+@pytest.mark.parametrize("asked", [True, False])
+def test_a_child_ends_with_a_killed_parent_that_asked_for_it(asked):
+    child = (
+        "from mjx_walk.utils.subprocesses import end_with_parent as e; import time; e(); print('up'); time.sleep(60)"
+    )
+    parent = (
+        "import os, subprocess, sys; from mjx_walk.utils.subprocesses import with_parent\n"
+        f"child = subprocess.Popen([sys.executable, '-uc', {child!r}], env=os.environ | (with_parent() if {asked} else {{}}),"
+        " stdout=subprocess.PIPE)\n"
+        "child.stdout.readline(); print(child.pid, flush=True); child.wait()\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, cwd=CLONE, text=True)
+    pid = int(process.stdout.readline())
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + (10 if asked else 0.5)
+    while _is_running(pid) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert _is_running(pid) != asked
+    if not asked:
+        os.kill(pid, signal.SIGKILL)
+
+
+def _is_running(pid):
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except FileNotFoundError:
+        return False
