@@ -36,8 +36,8 @@ def test_a_child_ends_with_a_killed_parent_that_asked_for_it(asked):
     )
     parent = (
         "import os, subprocess, sys; from mjx_walk.utils.subprocesses import with_parent\n"
-        f"child = subprocess.Popen([sys.executable, '-uc', {child!r}], env=os.environ | (with_parent() if {asked} else {{}}),"
-        " stdout=subprocess.PIPE)\n"
+        f"env = os.environ | (with_parent() if {asked} else {{}})\n"
+        f"child = subprocess.Popen([sys.executable, '-uc', {child!r}], env=env, stdout=subprocess.PIPE)\n"
         "child.stdout.readline(); print(child.pid, flush=True); child.wait()\n"
     )
     process = subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, cwd=CLONE, text=True)
