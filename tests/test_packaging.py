@@ -1,15 +1,18 @@
 """The package works editable, from a wheel or sdist, next to a clone, and from a clone."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 CLONE = Path(__file__).parent.parent
 
@@ -32,6 +35,19 @@ def python_use(cwd, paths=(), executable=sys.executable):
     )
     assert done.returncode == 0, done.stderr
     return Path(done.stdout.split()[-1])
+
+
+@pytest.mark.parametrize("python", ["3.11", "3.12"])
+def test_constraints_allow_what_the_package_needs(python):
+    """Names and versions alone, one for each package, with every requirement among them."""
+    lines = [line for line in (CLONE / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    pinned = [Requirement(line) for line in lines]
+    pinned = [pin for pin in pinned if pin.marker is None or pin.marker.evaluate({"python_version": python})]
+    versions = {pin.name: str(pin.specifier).removeprefix("==") for pin in pinned}
+    assert len(versions) == len(pinned) and all(re.fullmatch(r"[\d.]+", version) for version in versions.values())
+    project = tomllib.loads((CLONE / "pyproject.toml").read_text())["project"]
+    for requirement in map(Requirement, (*project["dependencies"], *project["optional-dependencies"]["warp"])):
+        assert requirement.specifier.contains(versions[requirement.name.lower()]), requirement
 
 
 @pytest.fixture(scope="module")
