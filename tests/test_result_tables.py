@@ -40,3 +40,13 @@ def test_normalized_scores_follow_from_the_table():
         found += [f"{np.mean(values):.2f}", f"{scipy.stats.trim_mean(values, 0.25):.2f}"]
     sentence = r"mean of ([\d.]+) and an interquartile mean of ([\d.]+), the best\s+ones ([\d.]+) and ([\d.]+)\."
     assert list(re.search(sentence, text).groups()) == found
+
+
+def test_the_scaling_figure_shows_the_factors_of_the_table():
+    spec = importlib.util.spec_from_file_location("scaling_figure", CLONE / "docs" / "scaling_figure.py")
+    figure = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(figure)
+    found = [f"{factor:.2f}" for values in figure.factors().values() for factor in values[1:]]
+    text = (CLONE / "docs" / "results.md").read_text()
+    shown = re.findall(r"^\| (?:PPO|csac) \| [24] \| [\d,]+ \| [\d,]+ \| ([\d.]+) \| [24] \|", text, flags=re.MULTILINE)
+    assert found == shown and len(shown) == 8

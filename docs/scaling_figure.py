@@ -1,0 +1,49 @@
+"""`python docs/scaling_figure.py`: draw scaling.png from the rows on several GPUs in experiments.csv."""
+
+import csv
+from pathlib import Path
+
+import matplotlib.figure
+
+DOCS = Path(__file__).parent
+SERIES = {
+    "PPO, 16,384 environments on each": ("SP41", "SP42", "SP43"),
+    "PPO, 16,384 in all": ("SP41", "SP44", "SP45"),
+    "csac, 2,048 environments on each": ("SP36", "SP37", "SP38"),
+    "csac, 2,048 in all": ("SP36", "SP39", "SP40"),
+}
+"""Arms on 1, 2 and 4 GPUs."""
+GPUS = (1, 2, 4)
+
+
+def factors() -> dict[str, list[float]]:
+    """Speed of each series, in multiples of that on one GPU."""
+    with (DOCS / "experiments.csv").open(newline="", encoding="utf-8") as file:
+        speeds = {row["id"]: float(row["final_mean"]) for row in csv.DictReader(file) if row["measure"] == "speed"}
+    return {label: [speeds[arm] / speeds[arms[0]] for arm in arms] for label, arms in SERIES.items()}
+
+
+def main() -> None:
+    """Draw the figure."""
+    figure = matplotlib.figure.Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(GPUS, GPUS, color="0.5", linestyle="--", label="ideal")
+    for number, (label, values) in enumerate(factors().items()):
+        style = "-" if number % 2 == 0 else ":"
+        axes.plot(GPUS, values, style, color=f"C{number // 2}", marker="o", label=label)
+        axes.annotate(
+            f"{values[-1]:.2f}", (GPUS[-1], values[-1]), (6, (-8, -4, 4, -4)[number]), textcoords="offset points"
+        )
+    axes.set_xticks(GPUS)
+    axes.set_yticks(GPUS)
+    axes.set_xlim(right=4.4)
+    axes.set_xlabel("H100 GPUs of one host")
+    axes.set_ylabel("steps per second, relative to one GPU")
+    axes.set_title("Training Humanoid-v5")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.savefig(DOCS / "scaling.png", dpi=110)
+
+
+if __name__ == "__main__":
+    main()
