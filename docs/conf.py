@@ -5,7 +5,11 @@ import re
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
+sys.path.insert(0, str(Path(__file__).parent))
+
+import generate
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 
 import mjx_walk
 
@@ -14,7 +18,7 @@ author = "The mjx_walk authors"
 copyright = "The mjx_walk authors"
 version = release = mjx_walk.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 exclude_patterns = ["_build", "examples"]
@@ -27,8 +31,10 @@ default_role = "code"
 html_theme = "furo"
 html_title = "mjx_walk"
 html_static_path = ["_static"]
-html_css_files = ["tables.css"]
+html_css_files = ["site.css"]
 html_copy_source = False
+html_math_renderer = "mathml"
+"""Browsers draw MathML themselves. MathJax would be loaded from a server."""
 
 _ROOT_PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md"}
 """Files at the top of the repository that the site shows as pages."""
@@ -62,6 +68,18 @@ def _adapt_included(app, path, docname: str, source: list[str]) -> None:
     source[0] = _with_links(posixpath.dirname(posixpath.normpath(posixpath.join("docs", path))), docname, source[0])
 
 
+def _show_inline_math(translator, node) -> None:
+    translator.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def _show_math(translator, node) -> None:
+    translator.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    raise nodes.SkipNode
+
+
 def setup(app) -> None:
+    app.connect("builder-inited", lambda app: generate.write())
+    app.add_html_math_renderer("mathml", (_show_inline_math, None), (_show_math, None))
     app.connect("source-read", _adapt_page)
     app.connect("include-read", _adapt_included)
