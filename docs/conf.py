@@ -24,9 +24,14 @@ myst_heading_anchors = 4
 exclude_patterns = ["_build", "examples"]
 
 autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented_params"
 autodoc_member_order = "bysource"
+autoclass_content = "both"
 default_role = "code"
 """Docstrings mark code with single backticks."""
+
+highlight_language = "none"
+"""Of blocks that name no language: commands."""
 
 html_theme = "furo"
 html_title = "mjx_walk"

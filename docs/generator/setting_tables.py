@@ -33,14 +33,12 @@ def settings_table(schema: type, prefix: str) -> str:
     """
     meanings = settings.meanings(schema)
     given = [row for row in settings.table(schema) if row.name not in ("name", "env", "algo")]
-    has_conditions = any(row.condition for row in given)
-    titles = ["Setting", "Default", "Valid", *(["Only with"] if has_conditions else []), "Meaning"]
     rows = []
     for row in given:
-        condition = [" or ".join(_condition(part) for part in row.condition.split(" or "))] if has_conditions else []
-        valid = row.valid.replace("|", ", ")
-        rows.append([code(prefix + row.name), code(row.default), valid, *condition, meanings[row.name]])
-    return table(titles, rows)
+        conditions = " or ".join(map(_condition, row.condition.split(" or "))) if row.condition else ""
+        meaning = meanings[row.name] + (f" Only with {conditions}." if conditions else "")
+        rows.append([code(prefix + row.name), code(row.default), row.valid.replace("|", ", "), meaning])
+    return table(["Setting", "Default", "Valid", "Meaning"], rows)
 
 
 def _condition(text: str) -> str:
