@@ -21,7 +21,7 @@ version = release = mjx_walk.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
-exclude_patterns = ["_build", "examples"]
+exclude_patterns = ["examples"]
 
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented_params"
