@@ -83,6 +83,11 @@ def test_ci_runs_the_very_test_command():
     assert command.endswith(".venv/bin/pytest") and command in (CLONE / ".ci" / "run").read_text().splitlines()
 
 
+def slug(title):
+    """The anchor of a heading, as GitHub and MyST make it."""
+    return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
+
+
 def test_files_they_link_to_are_there():
     for page, text in PAGES.items():
         for target in re.findall(r"\]\(([^)\s]+)\)", text):
@@ -90,7 +95,7 @@ def test_files_they_link_to_are_there():
             assert target.startswith("http") or (page.parent / name).exists(), f"{page}: {target}"
             if heading and not target.startswith("http"):
                 headings = re.findall(r"^#+ (.*)$", (page.parent / name).read_text(), flags=re.MULTILINE)
-                assert heading in {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in headings}, target
+                assert heading in map(slug, headings), f"{page}: {target}"
 
 
 def test_own_body(tmp_path, monkeypatch):
