@@ -151,7 +151,9 @@ def sizes(arguments):
     config = load_config([*first_job, "run_dir=null"])
     have = {f"algo.{field.name}" for field in dataclasses.fields(config.algo)} | {"num_envs", "evaluation.num_envs"}
     given = {argument.split("=")[0] for argument in arguments}
-    tiny = TINY if isinstance(config.algo, OnPolicyConfig) else TINY_OFF_POLICY
+    # REINFORCE learns from short unrolls only with a large tail.
+    on_policy = (*TINY, "algo.max_tail_discount=0.95")
+    tiny = on_policy if isinstance(config.algo, OnPolicyConfig) else TINY_OFF_POLICY
     return [setting for setting in tiny if setting.split("=")[0] in have - given]
 
 
