@@ -23,19 +23,29 @@ class AntOptions(TaskOptions):
 
     name: str = setting("ant", choices=("ant",))
     forward_reward_weight: float = 1.0
+    """Weight of the forward velocity."""
     ctrl_cost_weight: float = 0.5
+    """Weight of the squared action."""
     use_contact_forces: bool = setting(False, only_if={"version": "v4"})
     """Whether v4 observes contact forces and charges their cost."""
     contact_cost_weight: float = 5e-4
+    """Weight of the squared contact forces."""
     healthy_reward: float = 1.0
+    """Reward of one step in which the ant is healthy."""
     main_body: int | str = 1
     """Body whose forward speed is rewarded, by its index or name."""
     terminate_when_unhealthy: bool = True
+    """End the episode when the ant is not healthy."""
     healthy_z_range: tuple[float, float] = (0.2, 1.0)
+    """Heights of the root in which the ant is healthy, m."""
     contact_force_range: tuple[float, float] = (-1.0, 1.0)
+    """Bounds of each contact force and torque, N and N·m."""
     reset_noise_scale: float = setting(0.1, at_least=0)
+    """Bound of the uniform noise on positions of a reset, and std of the noise on velocities."""
     exclude_current_positions_from_observation: bool = True
+    """Leave the root's x and y out of the observation."""
     include_cfrc_ext_in_observation: bool = True
+    """Observe the contact forces on each body."""
 
 
 class Ant(Task):

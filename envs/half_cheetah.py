@@ -20,8 +20,11 @@ class HalfCheetahOptions(PlanarBodyOptions):
 
     name: str = setting("half_cheetah", choices=("half_cheetah",))
     forward_reward_weight: float = 1.0
+    """Weight of the forward velocity."""
     ctrl_cost_weight: float = 0.1
+    """Weight of the squared action."""
     reset_noise_scale: float = setting(0.1, at_least=0)
+    """Bound of the uniform noise on positions of a reset, and std of the noise on velocities."""
 
 
 class HalfCheetah(PlanarBody):

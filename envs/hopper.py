@@ -23,13 +23,21 @@ class HopperOptions(PlanarBodyOptions):
     name: str = setting("hopper", choices=("hopper",))
     frame_skip: int = setting(4, at_least=1)
     forward_reward_weight: float = 1.0
+    """Weight of the forward velocity."""
     ctrl_cost_weight: float = 1e-3
+    """Weight of the squared action."""
     healthy_reward: float = 1.0
+    """Reward of one step in which the hopper is healthy."""
     terminate_when_unhealthy: bool = True
+    """End the episode when the hopper is not healthy."""
     healthy_state_range: tuple[float, float] = (-100.0, 100.0)
+    """Values of angles and velocities in which the hopper is healthy, rad, m/s and rad/s."""
     healthy_z_range: tuple[float, float] = (0.7, float("inf"))
+    """Heights of the root in which the hopper is healthy, m."""
     healthy_angle_range: tuple[float, float] = (-0.2, 0.2)
+    """Angles of the torso in which the hopper is healthy, rad."""
     reset_noise_scale: float = setting(5e-3, at_least=0)
+    """Bound of the uniform noise on positions and velocities of a reset."""
 
 
 class Hopper(PlanarBody):

@@ -20,12 +20,19 @@ class HumanoidOptions(HumanoidBodyOptions):
 
     name: str = setting("humanoid", choices=("humanoid",))
     forward_reward_weight: float = 1.25
+    """Weight of the forward velocity."""
     ctrl_cost_weight: float = 0.1
+    """Weight of the squared action."""
     contact_cost_weight: float = 5e-7
+    """Weight of the squared contact forces."""
     contact_cost_range: tuple[float, float] = (-float("inf"), 10.0)
+    """Bounds of the weighted contact cost."""
     healthy_reward: float = 5.0
+    """Reward of one step in which the humanoid is healthy."""
     terminate_when_unhealthy: bool = True
+    """End the episode when the humanoid is not healthy."""
     healthy_z_range: tuple[float, float] = (1.0, 2.0)
+    """Heights of the root in which the humanoid is healthy, m."""
 
 
 class Humanoid(HumanoidBody):

@@ -25,11 +25,17 @@ class HumanoidBodyOptions(TaskOptions):
     """Keyword arguments of both humanoids. v4 does not take the flags `include_…`."""
 
     reset_noise_scale: float = setting(1e-2, at_least=0)
+    """Bound of the uniform noise on positions and velocities of a reset."""
     exclude_current_positions_from_observation: bool = True
+    """Leave the root's x and y out of the observation."""
     include_cinert_in_observation: bool = True
+    """Observe mass and inertia of each body."""
     include_cvel_in_observation: bool = True
+    """Observe the velocity of each body."""
     include_qfrc_actuator_in_observation: bool = True
+    """Observe the motors' torques."""
     include_cfrc_ext_in_observation: bool = True
+    """Observe the contact forces on each body."""
 
 
 class HumanoidBody(Task):

@@ -22,8 +22,11 @@ class HumanoidStandupOptions(HumanoidBodyOptions):
     uph_cost_weight: float = setting(1.0, only_if={})
     """Has no effect, as in Gymnasium."""
     ctrl_cost_weight: float = 0.1
+    """Weight of the squared action."""
     impact_cost_weight: float = 0.5e-6
+    """Weight of the squared contact forces."""
     impact_cost_range: tuple[float, float] = (-float("inf"), 10.0)
+    """Bounds of the weighted impact cost."""
 
 
 class HumanoidStandup(HumanoidBody):

@@ -28,7 +28,9 @@ class InvertedDoublePendulumOptions(TaskOptions):
 
     name: str = setting("inverted_double_pendulum", choices=("inverted_double_pendulum",))
     healthy_reward: float = 10.0
+    """Reward of one step in which the poles stand."""
     reset_noise_scale: float = setting(0.1, at_least=0)
+    """Bound of the uniform noise on positions of a reset, and std of the noise on velocities."""
 
 
 class InvertedDoublePendulum(Task):

@@ -28,6 +28,7 @@ class InvertedPendulumOptions(TaskOptions):
     name: str = setting("inverted_pendulum", choices=("inverted_pendulum",))
     frame_skip: int = setting(2, at_least=1)
     reset_noise_scale: float = setting(1e-2, at_least=0)
+    """Bound of the uniform noise on positions and velocities of a reset."""
 
 
 class InvertedPendulum(Task):

@@ -18,6 +18,7 @@ class PlanarBodyOptions(TaskOptions):
     """Keyword argument of all planar bodies."""
 
     exclude_current_positions_from_observation: bool = True
+    """Leave the root's x out of the observation."""
 
 
 class PlanarBody(Task):

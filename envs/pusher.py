@@ -35,8 +35,11 @@ class PusherOptions(TaskOptions):
     name: str = setting("pusher", choices=("pusher",))
     max_episode_steps: int = setting(100, at_least=1)
     reward_near_weight: float = 0.5
+    """Weight of the distance from fingertip to object."""
     reward_dist_weight: float = 1.0
+    """Weight of the distance from object to goal."""
     reward_control_weight: float = 0.1
+    """Weight of the squared action."""
 
 
 class Pusher(Task):

@@ -33,7 +33,9 @@ class ReacherOptions(TaskOptions):
     frame_skip: int = setting(2, at_least=1)
     max_episode_steps: int = setting(50, at_least=1)
     reward_dist_weight: float = 1.0
+    """Weight of the distance to the target."""
     reward_control_weight: float = 1.0
+    """Weight of the squared action."""
 
 
 class Reacher(Task):

@@ -25,9 +25,13 @@ class SwimmerOptions(TaskOptions):
     name: str = setting("swimmer", choices=("swimmer",))
     frame_skip: int = setting(4, at_least=1)
     forward_reward_weight: float = 1.0
+    """Weight of the forward velocity."""
     ctrl_cost_weight: float = 1e-4
+    """Weight of the squared action."""
     reset_noise_scale: float = setting(0.1, at_least=0)
+    """Bound of the uniform noise on positions and velocities of a reset."""
     exclude_current_positions_from_observation: bool = True
+    """Leave the root's x and y out of the observation."""
 
 
 class Swimmer(Task):

@@ -19,10 +19,13 @@ class TaskOptions:
 
     name: str = ""
     version: str = setting("v5", choices=("v5", "v4"))
+    """Version of Gymnasium's environment."""
     xml_file: str | None = None
     """Model file: a path, or the name of one of Gymnasium's assets. Default: the version's own model."""
     frame_skip: int = setting(5, at_least=1)
+    """Physics steps of one environment step."""
     max_episode_steps: int = setting(1000, at_least=1, at_most=NO_TIME_LIMIT)
+    """Time limit, in environment steps."""
     shaping: Shaping = dataclasses.field(default_factory=Shaping)
     """Weights of additional reward terms."""
     reward_function: str | None = None

@@ -23,12 +23,19 @@ class Walker2dOptions(PlanarBodyOptions):
     name: str = setting("walker2d", choices=("walker2d",))
     frame_skip: int = setting(4, at_least=1)
     reset_noise_scale: float = setting(5e-3, at_least=0)
+    """Bound of the uniform noise on positions and velocities of a reset."""
     forward_reward_weight: float = 1.0
+    """Weight of the forward velocity."""
     ctrl_cost_weight: float = 1e-3
+    """Weight of the squared action."""
     healthy_reward: float = 1.0
+    """Reward of one step in which the walker is healthy."""
     terminate_when_unhealthy: bool = True
+    """End the episode when the walker is not healthy."""
     healthy_z_range: tuple[float, float] = (0.8, 2.0)
+    """Heights of the root in which the walker is healthy, m."""
     healthy_angle_range: tuple[float, float] = (-1.0, 1.0)
+    """Angles of the torso in which the walker is healthy, rad."""
 
 
 class Walker2d(PlanarBody):

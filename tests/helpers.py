@@ -24,7 +24,8 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing import rendering
 
 CLONE = Path(__file__).parent.parent
-README = (CLONE / "README.md").read_text()
+PAGES = {path: path.read_text() for path in (CLONE / "README.md", *sorted((CLONE / "docs").rglob("*.md")))}
+"""README and the pages of the documentation, by their paths."""
 OLD_RUNS = CLONE / "tests" / "runs" / "old_runs"
 """A run folder of each algorithm, written by an earlier version."""
 
@@ -234,7 +235,14 @@ renders = pytest.mark.skipif(not can_render(), reason="nothing to render with: i
 
 
 def blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+    """The fenced blocks of README and the documentation in a language."""
+    return [block for text in PAGES.values() for block in fenced(text, language)]
+
+
+def fenced(text, language):
+    """The fenced blocks of a page in a language; `""` for those that name none."""
+    found = re.findall(r"^```(\S*)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
+    return [block for name, block in found if name == language]
 
 
 def values(metrics):

@@ -2,9 +2,23 @@
 
 import importlib.util
 import re
+import shlex
+import subprocess
+import sys
 
 import pytest
-from helpers import CLONE, TINY, TINY_CALL, command_here, renders, train_here, unregistered
+from helpers import (
+    CLONE,
+    ENVIRONMENT,
+    PAGES,
+    TINY,
+    TINY_CALL,
+    command_here,
+    fenced,
+    renders,
+    train_here,
+    unregistered,
+)
 
 import mjx_walk
 from mjx_walk.envs import registry
@@ -67,3 +81,31 @@ def test_own_algorithm_trains(tmp_path):
     run = mjx_walk.run([*small, "algo=huber_a2c", "algo.huber_delta=0.5", "total_steps=1", f"run_dir={tmp_path}/run"])
     assert run.config.algo.name == "huber_a2c" and run.metrics[-1]["train/value_loss"] >= 0
     assert run.config.algo.init_noise_std == 0.5  # of the recipe of A2C
+
+
+def shell_line(page, text):
+    """The line of a page's blocks that contains a text, as arguments of this interpreter."""
+    (line,) = [
+        line for block in fenced(PAGES[CLONE / "docs" / page], "") for line in block.splitlines() if text in line
+    ]
+    return [sys.executable, *shlex.split(line.partition("python ")[2])]
+
+
+@pytest.mark.slow
+def test_the_reproduction_steps_on_a_cpu(tmp_path):
+    """The first of its commands. The second one needs two GPUs."""
+    sizes = {"NUM_ENVS": "2", "NUM_STEPS": "1", "REFERENCE": f"{tmp_path}/reference.npy", "JAX_PLATFORMS": "cpu"}
+    arguments = shell_line("multi_gpu.md", "multi_gpu_repro.py one")
+    done = subprocess.run(arguments, cwd=CLONE, env=ENVIRONMENT | sizes, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "difference after one step 0.0e+00, finite True" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("rl_zoo3") is None, reason="pip install rl_zoo3")
+def test_rl_zoo3_trains_with_the_page_s_settings(tmp_path):
+    settings = next(block for block in fenced(PAGES[CLONE / "docs" / "gymnasium.md"], "") if "settings.yml" in block)
+    (tmp_path / "settings.yml").write_text(settings)
+    arguments = [*shell_line("gymnasium.md", "rl_zoo3.train"), "--n-timesteps", "2048"]
+    done = subprocess.run(arguments, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -28,8 +28,11 @@ class PPOConfig(OnPolicyConfig):
 
     name: str = setting("ppo", choices=("ppo",))
     num_minibatches: int = setting(32, at_least=1)
+    """Minibatches of one epoch, with one gradient step each."""
     num_epochs: int = setting(8, at_least=1)
+    """Passes over one batch."""
     clip_epsilon: float = setting(0.3, above=0)
+    """Largest change of the probability ratio from 1, ε."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -25,6 +25,7 @@ class SACConfig(OffPolicyConfig):
     init_alpha: float = setting(1.0, above=0)
     """Initial temperature."""
     alpha_learning_rate: float = setting(3e-4, above=0)
+    """Step size of Adam for the temperature."""
     target_entropy: float = setting(-0.5, below=0.69)
     """Entropy at which the temperature keeps the policy, in nats per action dimension; Brax uses -0.5. Actions lie in
     `[-1, 1]`, so no policy has more than ln 2, and under a higher target the temperature would grow without bound."""

@@ -16,6 +16,7 @@ class TD3Config(DeterministicConfig):
     target_noise: float = setting(0.2, at_least=0)
     """Std of the noise that smooths the target policy, in `[-1, 1]`."""
     target_noise_clip: float = setting(0.5, at_least=0, only_if={"target_noise": AnyBut(0)})
+    """Bound of the target policy's noise."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -64,6 +64,7 @@ class Config:
     physics: str = setting("auto", choices=("auto", *ENGINES))
     """Physics engine, see `mjx_walk.envs.physics`."""
     seed: int = setting(0, at_least=0, at_most=2**32 - 1)
+    """Seed of all random numbers of the run."""
     num_envs: int = setting(8192, at_least=1, at_most=2**31 - 1)
     """Training environments on each device."""
     total_steps: int = setting(100_000_000, at_least=1)

@@ -1,13 +1,27 @@
 """Settings that declare their valid range, and where they have an effect, next to their default."""
 
+import ast
 import dataclasses
+import inspect
 import math
+import textwrap
 from collections.abc import Iterable
 from typing import Any, NamedTuple, TypeVar
 
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["AnyBut", "describe", "has_effect", "refuse_ineffective", "setting", "validate", "with_name"]
+__all__ = [
+    "AnyBut",
+    "Row",
+    "describe",
+    "has_effect",
+    "meanings",
+    "refuse_ineffective",
+    "setting",
+    "table",
+    "validate",
+    "with_name",
+]
 
 Schema = TypeVar("Schema")
 
@@ -157,24 +171,68 @@ def _blockers(owner: Any, name: str) -> list[str] | None:
     return found
 
 
-def describe(schema: type, prefix: str = "") -> list[str]:
-    """A line for each setting of a dataclass: `key=default`, its valid range, and where it has an effect.
+class Row(NamedTuple):
+    """One setting as users read it."""
 
-    Settings that never have an effect, or have a single valid value, are left out.
+    name: str
+    default: str
+    """As in YAML."""
+    valid: str
+    """Valid range or choices; empty if every value of the type is valid."""
+    condition: str
+    """Values of other settings under which it has an effect; empty if it always has one."""
+
+
+def table(schema: type) -> list[Row]:
+    """A row for each setting of a dataclass.
+
+    Settings that never have an effect, have a single valid value or hold further settings are left out.
+
+    Args:
+        schema: dataclass whose fields have defaults.
+    """
+    rows = []
+    for field in dataclasses.fields(schema):
+        conditions = field.metadata.get("only_if")
+        is_group = field.default is dataclasses.MISSING
+        if is_group or conditions == {} or len(field.metadata.get("choices", "ab")) == 1:
+            continue
+        condition = _as_text(conditions) if conditions else ""
+        rows.append(Row(field.name, _as_yaml(field.default), _range(field.metadata), condition))
+    return rows
+
+
+def describe(schema: type, prefix: str = "") -> list[str]:
+    """A line for each row of `table`: `key=default`, its valid range, and where it has an effect.
 
     Args:
         schema: dataclass whose fields have defaults.
         prefix: start of the full keys, such as `algo.`.
     """
     lines = []
-    for field in dataclasses.fields(schema):
-        conditions = field.metadata.get("only_if")
-        if conditions == {} or len(field.metadata.get("choices", "ab")) == 1:
-            continue
-        notes = [_range(field.metadata), _as_text(conditions) if conditions else ""]
-        text = f"{prefix}{field.name}={_as_yaml(field.default)}"
+    for row in table(schema):
+        notes = [row.valid, f"only with {row.condition}" if row.condition else ""]
+        text = f"{prefix}{row.name}={row.default}"
         lines.append(f"{text:<48} {'; '.join(note for note in notes if note)}".rstrip())
     return lines
+
+
+def meanings(schema: type) -> dict[str, str]:
+    """The docstrings below the fields of a dataclass, by field. A field without one has that of the base class.
+
+    Args:
+        schema: dataclass whose source is available.
+    """
+    found: dict[str, str] = {}
+    for kind in reversed(schema.__mro__[:-1]):
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+        assert isinstance(definition, ast.ClassDef)
+        for field, below in zip(definition.body, definition.body[1:], strict=False):
+            if not (isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)):
+                continue
+            if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+                found[field.target.id] = " ".join(str(below.value.value).split())
+    return found
 
 
 def _range(limits: Any) -> str:
@@ -188,7 +246,7 @@ def _as_text(conditions: dict[str, Any]) -> str:
         f"{other} other than {_as_yaml(wanted.value)}" if isinstance(wanted, AnyBut) else f"{other}={_as_yaml(wanted)}"
         for other, wanted in conditions.items()
     ]
-    return f"only with {' or '.join(alternatives)}"
+    return " or ".join(alternatives)
 
 
 def _as_yaml(value: Any) -> str:

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import AnyBut, describe, has_effect, refuse_ineffective, setting, validate
+from mjx_walk.utils.settings import AnyBut, describe, has_effect, meanings, refuse_ineffective, setting, validate
 
 
 @dataclasses.dataclass
@@ -76,6 +76,25 @@ def test_a_description_gives_default_range_and_condition():
         "algo.mode=off off|on",
         "algo.sizes=[32,32]",
     ]
+
+
+def test_a_meaning_is_the_docstring_below_a_field_or_that_of_the_base_class():
+    @dataclasses.dataclass
+    class Base:
+        rate: float = 0.1
+        """Step size
+        of Adam."""
+        steps: int = 1
+        """Steps."""
+        silent: int = 1
+
+    @dataclasses.dataclass
+    class Derived(Base):
+        rate: float = 0.2
+        steps: int = 2
+        """Steps of all environments."""
+
+    assert meanings(Derived) == {"rate": "Step size of Adam.", "steps": "Steps of all environments."}
 
 
 @pytest.mark.parametrize("seed", [10**12 + 1, -(2**63), 10**4000])

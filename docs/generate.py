@@ -1,0 +1,46 @@
+"""`python docs/generate.py`: write the generated parts of the documentation.
+
+The results are committed, so that the pages are complete on GitHub. Sphinx runs this at the start of every build, and
+a test fails if a committed page differs.
+"""
+
+from pathlib import Path
+
+from generator import setting_tables, task_pages
+from generator.markdown import with_block
+
+from mjx_walk.algos import BUILT_IN_ALGORITHMS
+from mjx_walk.envs import BUILT_IN_TASKS
+
+DOCS = Path(__file__).parent
+
+
+def pages() -> dict[Path, str]:
+    """Every page with generated parts, as it must be, by its path."""
+    found = {DOCS / "tasks" / f"{name}.md": task_pages.page(name) for name in BUILT_IN_TASKS}
+    found[DOCS / "tasks" / "index.md"] = _filled("tasks/index.md", {"tasks": task_pages.overview_of_all()})
+    groups = {name: setting_tables.group_table(name) for name in setting_tables.GROUPS}
+    found[DOCS / "configuration.md"] = _filled("configuration.md", groups)
+    for name in BUILT_IN_ALGORITHMS:
+        blocks = {"settings": setting_tables.algorithm_table(name), "scores": setting_tables.score_table(name)}
+        found[DOCS / "algorithms" / f"{name}.md"] = _filled(f"algorithms/{name}.md", blocks)
+    return found
+
+
+def _filled(name: str, blocks: dict[str, str]) -> str:
+    """A handwritten page with its generated blocks."""
+    page = (DOCS / name).read_text()
+    for block, content in blocks.items():
+        page = with_block(page, block, content)
+    return page
+
+
+def write() -> None:
+    """Write the pages that have changed."""
+    for path, text in pages().items():
+        if not path.exists() or path.read_text() != text:
+            path.write_text(text)
+
+
+if __name__ == "__main__":
+    write()

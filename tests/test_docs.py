@@ -1,0 +1,54 @@
+"""The generated parts of the documentation."""
+
+import importlib
+import re
+
+import pytest
+from helpers import CLONE
+
+from mjx_walk.algos import BUILT_IN_ALGORITHMS
+from mjx_walk.envs import BUILT_IN_TASKS, TASKS
+from mjx_walk.utils import settings
+
+DOCS = CLONE / "docs"
+
+
+@pytest.fixture(autouse=True)
+def _generator_on_path(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS))
+
+
+def test_committed_pages_are_what_the_code_gives():
+    pages = importlib.import_module("generate").pages()
+    stale = [str(path.relative_to(CLONE)) for path, text in pages.items() if path.read_text() != text]
+    assert not stale, "run python docs/generate.py, and commit its changes"
+    names = {path.relative_to(DOCS).as_posix() for path in pages}
+    assert names == {
+        *(f"tasks/{name}.md" for name in ("index", *BUILT_IN_TASKS)),
+        *(f"algorithms/{name}.md" for name in BUILT_IN_ALGORITHMS),
+        "configuration.md",
+    }
+
+
+@pytest.mark.parametrize("folder", ["tasks", "algorithms"])
+def test_every_page_is_listed(folder):
+    pages = {path.stem for path in (DOCS / folder).glob("*.md")} - {"index"}
+    listed = re.search(r"```\{toctree\}\n:hidden:\n\n(.*?)\n```", (DOCS / folder / "index.md").read_text(), re.DOTALL)
+    assert pages == set(listed[1].split())
+
+
+def test_every_setting_has_a_meaning():
+    schemas = importlib.import_module("generator.setting_tables").all_schemas()
+    assert len(schemas) == 5 + len(BUILT_IN_TASKS) + len(BUILT_IN_ALGORITHMS)
+    for schema in schemas:
+        meanings = settings.meanings(schema)
+        missing = {row.name for row in settings.table(schema)} - {*meanings, "name", "env", "algo"}
+        assert not missing, schema.__name__
+        assert all(meaning.endswith(".") for meaning in meanings.values())
+
+
+def test_every_reward_term_has_its_words():
+    texts = importlib.import_module("generator.task_texts").TEXTS
+    assert texts.keys() == {*BUILT_IN_TASKS}
+    for name, text in texts.items():
+        assert text.rewards.keys() == {term for terms in TASKS[name][0].REWARD_TERMS.values() for term in terms}
