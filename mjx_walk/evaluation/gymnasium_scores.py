@@ -1,6 +1,7 @@
 """Scores of a policy: in the real Gymnasium, or in a run's own engine."""
 
 import contextlib
+import dataclasses
 import os
 import pickle
 from collections.abc import Callable
@@ -14,11 +15,23 @@ from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
 from mjx_walk.evaluation.gymnasium_worker import send
 from mjx_walk.runs.scores import Scores
+from mjx_walk.utils.settings import setting
 from mjx_walk.utils.subprocesses import start_module
 from mjx_walk.utils.types import PolicyFn
 
 _MAX_PARALLEL_EPISODES = 1024
 """Episodes played at once; an environment takes about 1 MB."""
+
+
+@dataclasses.dataclass
+class ScoreRequest:
+    """What a user asks to be scored."""
+
+    episodes: int = setting(100, at_least=1)
+    backend: str = setting("gymnasium", choices=("gymnasium", "sim"))
+    seed: int = setting(0, at_least=0)
+
+
 Episodes = Callable[[jax.Array, int], tuple[jax.Array, jax.Array]]
 """`key, N → returns [N] f32, lengths [N] i32`."""
 

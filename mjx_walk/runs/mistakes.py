@@ -94,7 +94,7 @@ def unknown_key(key: str, env: str, algo: str) -> str:
     owners = _owners(section, name)
     if owners:
         full, having = owners
-        return f"unknown key '{key}'; {full} is a setting of {', '.join(having)}, and not of {_chosen_in(full, env, algo)}"
+        return f"unknown key '{key}'; {full} is a setting of {', '.join(having)}, not of {_chosen_in(full, env, algo)}"
     own = [known for known in types if known.rpartition(".")[0] == section and section]
     if own and len(own) <= _MOST_LISTED:
         return f"unknown key '{key}'; choose one of: {', '.join(own)}"
@@ -138,7 +138,7 @@ def _unfit_recipe(text: str, given: dict[str, str], env: str, algo: str) -> str:
     meant_env, _, meant_algo = recipe.rpartition("/")[2].rpartition("_")
     meant = [f"env={meant_env}"] if meant_env in TASKS and meant_env != env else []
     meant += [f"algo={meant_algo}"] if meant_algo in ALGORITHMS and meant_algo != algo else []
-    hint = f"write {' '.join(meant)} with it" if meant else fitting_recipes(env, algo)
+    hint = f"add {' '.join(meant)}" if meant else fitting_recipes(env, algo)
     return f"recipe={recipe} does not fit env={env} algo={algo}; {hint}"
 
 
@@ -162,5 +162,5 @@ def _several_values(key: str, text: str, types: dict[str, Any]) -> str:
     mistake = type_mistake(key, text, types.get(key)) or ""
     if "; write " in mistake:
         return mistake
-    seeds = f"seeds=[{text}] or " if key == "seed" else ""
-    return f"{key}={text}: there are several values; write one, or {seeds}-m to train a run with each"
+    alternative = f"write seeds=[{text}]" if key == "seed" else "add -m"
+    return f"{key}={text} gives several values; give one, or {alternative} to train a run with each"

@@ -180,7 +180,9 @@ def read_seeds(value: Any) -> list[int]:
     are_seeds = isinstance(seeds, list) and all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds)
     if are_seeds and seeds and len(set(seeds)) == len(seeds):
         return seeds
-    raise UserError(f"seeds={value}: give a number of seeds, or a list of different seeds from 0 up: seeds=3 or seeds=[3,7]")
+    raise UserError(
+        f"seeds={value}: give a number of seeds, or a list of different seeds from 0 up: seeds=3 or seeds=[3,7]"
+    )
 
 
 def check_writable(path: Path) -> None:

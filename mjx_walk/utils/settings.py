@@ -75,7 +75,7 @@ def validate(config: Any, prefix: str = "") -> None:
             continue
         mistake = type_problem(value, hints[field.name])
         if mistake:
-            raise UserError(f"{key}={value}: {mistake}")
+            raise UserError(f"{key}={value!r}: {mistake}")
         for item in value if isinstance(value, list | tuple) else (value,):
             problem = _problem(item, field.metadata)
             if problem:

@@ -17,10 +17,10 @@ _PLAIN = {
     bool: ("must be true or false", (bool, np.bool_)),
     int: ("must be an integer", (numbers.Integral,)),
     float: ("must be a number", (numbers.Real,)),
-    str: ("must be a text", (str, os.PathLike)),
+    str: ("must be a string", (str, os.PathLike)),
 }
 """For each type of a setting, what is said of other values, and the types of valid ones."""
-_PLURALS = {int: "integers", float: "numbers", str: "texts", bool: "values true or false"}
+_PLURALS = {int: "integers", float: "numbers", str: "names", bool: "values true or false"}
 _NUMBER = r"[+-]?\d[\d_]*(\.\d*)?([eE][+-]?\d+)?"
 _MOST_DIGITS = 30
 """Larger numbers stay as they are: none is valid."""
@@ -73,7 +73,8 @@ def type_mistake(key: str, text: str, hint: Any) -> str | None:
     if dataclasses.is_dataclass(kind):
         keys = ", ".join(f"{key}.{field.name}" for field in dataclasses.fields(kind))
         return f"{key}={text}: {key} is a group of settings; give one of them: {keys}"
-    return f"{key}={text}: {problem}{_correction(key, text, kind)}"
+    correction = _correction(key, text, kind)
+    return f"{key}={text}: {problem.partition(', such')[0] if correction else problem}{correction}"
 
 
 def with_whole_number(text: str) -> str:
@@ -97,7 +98,7 @@ def _correction(key: str, text: str, kind: Any) -> str:
     if typing.get_origin(kind) is tuple:
         items, length = _items(kind)
         parts = text.strip("()[] ,").split(",")
-        pattern = rf"\s*{_NUMBER}\s*" if items in (int, float) else r".+"
+        pattern = {int: r"\s*[+-]?\d+\s*", float: rf"\s*{_NUMBER}\s*"}.get(items, ".+")
         if all(re.fullmatch(pattern, part) for part in parts) and length in (None, len(parts)):
             return f"; write {key}=[{','.join(part.strip() for part in parts)}]"
     return ""
@@ -111,7 +112,8 @@ def _must_be(kind: Any) -> str | None:
     if typing.get_origin(kind) is tuple:
         items, length = _items(kind)
         count = "" if length is None else f"{length} "
-        return f"must be a list of {count}{_PLURALS.get(items, 'values')}"
+        example = f", such as [{','.join(map(str, range(1, length + 1)))}]" if length and items in (int, float) else ""
+        return f"must be a list of {count}{_PLURALS.get(items, 'values')}{example}"
     return None
 
 

@@ -148,7 +148,7 @@ def test_a_suite_has_every_environment_with_its_own_recipe(tmp_path):
     out, planned = suite.plan_suite("mujoco", [], ["ppo"], [3], str(tmp_path), "cpu")
     assert out == tmp_path and len({run.config.env.name for run in planned}) == 11 == len(planned)
     assert planned[1].name == "humanoid_standup/ppo/seed_3" and planned[1].folder.path == tmp_path / planned[1].name
-    with pytest.raises(UserError, match="suite=mujoco has its own environments; leave one of both out"):
+    with pytest.raises(UserError, match="suite=mujoco has its own environments; leave out one of the two"):
         suite.plan_suite("mujoco", ["env=ant"], ["ppo"], [0], None, "cpu")
 
 
@@ -217,18 +217,18 @@ BAD = [
     (["algos=[]"], "algos=[]: choose some of: ppo"),
     (["seeds=0"], "seeds=0: give a number of seeds, or a list of different seeds from 0 up"),
     (["seeds=[a]"], "give a number of seeds"),
-    (["algo=ppo"], "'algo=ppo': in a comparison write algos=[…]"),
-    (["seed=1"], "write seeds=N"),
+    (["algo=ppo"], "'algo=ppo': in a comparison write 'algos=[ppo]'"),
+    (["seed=1"], "'seed=1': in a comparison write seeds=[1]"),
     (["devices=99"], "devices=99: this machine has"),
     (["per_device=0"], "per_device=0: must be at least 1"),
     (["env=snake"], "unknown env 'snake'"),
     (["algo.discount=0.9,2.0"], "algo.discount=2.0: must be at most 1"),
     (["draw=true", "out=nowhere"], "no runs below 'nowhere'"),
     (["suite=atari"], "suite=atari: choose one of: mujoco"),
-    (["suite=mujoco", "env=ant"], "'env=ant': suite=mujoco has its own environments; leave one of both out"),
+    (["suite=mujoco", "env=ant"], "'env=ant': suite=mujoco has its own environments; leave out one of the two"),
     (["draw=true"], "say which runs to draw: out=DIR"),
-    (["env=walker2d,humanoid"], "one comparison is of one environment, not of humanoid v5, walker2d v5"),
-    (["env.version=v4,v5"], "one comparison is of one environment"),
+    (["env=walker2d,humanoid"], "a comparison has one environment; give one of them, or suite=mujoco for all"),
+    (["env.version=v4,v5"], "a comparison has one environment; these are several: humanoid v4, humanoid v5"),
     (["algo.discount=interval(0.9,0.99)"], "list the values, algo.discount=A,B"),
     (["algos=[ppo"], "algos=[ppo: "),
 ]
