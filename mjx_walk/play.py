@@ -103,7 +103,7 @@ def _shown(arguments: Arguments, length: float) -> tuple[float, float]:
     """
     if arguments.start is not None and arguments.start >= length:
         raise UserError(
-            f"start={arguments.start:g} is past the end of the episode, which lasts {length:.1f} s; give a smaller one"
+            f"start={arguments.start:g} is past the end of the episode, which lasts {length:.2f} s; give a smaller one"
         )
     seconds = _SECONDS if arguments.seconds is None else arguments.seconds
     start = min(_START, max(0.0, length - seconds)) if arguments.start is None else arguments.start

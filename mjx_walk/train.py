@@ -166,7 +166,7 @@ def _through_hydra(arguments: list[str]) -> None:
     parsed = OverridesParser.create().parse_overrides(overrides)
     for override in parsed:
         if override.is_sweep_override() and not any(True for _ in override.sweep_iterator()):
-            raise UserError(f"{override.input_line}: there is no value in it; write one, or several with commas")
+            raise UserError(f"{override.input_line} gives no value; give one, or several with commas")
     plain = [o for o in parsed if not o.is_sweep_override() and not o.key_or_group.startswith("hydra")]
     # Reports errors in one line, where Hydra takes several. A swept setting may enable others.
     check = compose_config if any(o.is_sweep_override() for o in parsed) else load_config

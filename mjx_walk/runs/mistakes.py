@@ -28,6 +28,7 @@ _ELSEWHERE = {
     "n_epochs": "algo.num_epochs",
     "net_arch": "algo.policy_hidden_layer_sizes",
     "out": "run_dir",
+    "run": "run_dir",
     "steps": "total_steps",
     "timesteps": "total_steps",
     "total_timesteps": "total_steps",
@@ -88,13 +89,14 @@ def unknown_key(key: str, env: str, algo: str) -> str:
     types = setting_types(env, algo)
     groups = [known for known, hint in types.items() if hasattr(plain_type(hint), "__dataclass_fields__")]
     section, _, name = key.rpartition(".")
-    near = _similar(key, [known for known in types if known not in groups])
-    if near:
-        return f"unknown key '{key}'; did you mean: {', '.join(near)}?"
+    settings = [known for known in types if known not in groups]
     owners = _owners(section, name)
-    if owners:
+    if owners and owners[0] not in settings:
         full, having = owners
         return f"unknown key '{key}'; {full} is a setting of {', '.join(having)}, not of {_chosen_in(full, env, algo)}"
+    near = _similar(key, settings)
+    if near:
+        return f"unknown key '{key}'; did you mean: {', '.join(near)}?"
     own = [known for known in types if known.rpartition(".")[0] == section and section]
     if own and len(own) <= _MOST_LISTED:
         return f"unknown key '{key}'; choose one of: {', '.join(own)}"

@@ -108,7 +108,7 @@ def _must_be(kind: Any) -> str | None:
     if kind in _PLAIN:
         return _PLAIN[kind][0]
     if dataclasses.is_dataclass(kind):
-        return f"must be a {kind.__name__}"  # type: ignore[union-attr]
+        return f"must be a {getattr(kind, '__name__', kind)} or a dictionary of its settings"
     if typing.get_origin(kind) is tuple:
         items, length = _items(kind)
         count = "" if length is None else f"{length} "

@@ -303,10 +303,26 @@ def test_a_second_comparison_in_the_same_folder_waits_its_turn(tmp_path):
     assert planned_runs.run_jobs([], [None], tmp_path / "out" / "logs", lambda run, log: None) is None
 
 
+@pytest.mark.parametrize(
+    ("log", "reason"),
+    [
+        ("Training …\nerror: no space\n", ": no space"),
+        ("Traceback (most recent call last):\n  …\njaxlib.XlaRuntimeError: no\n", ": jaxlib.XlaRuntimeError: no"),
+        ("XlaRuntimeError: RESOURCE_EXHAUSTED: 5 GB\n", ": memory ran out, so try together=1 or a smaller num_envs"),
+        ("Training …\n", ""),
+    ],
+)
+def test_the_reason_of_a_failure_is_the_last_line_of_its_log(tmp_path, log, reason):
+    (tmp_path / "log.txt").write_text(log)
+    assert compare_command._reason(tmp_path / "log.txt") == reason
+
+
 def test_a_run_that_fails_is_named(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     assert command_here("compare", "algos=[ppo]", "seeds=1", "out=out", *SMALL, "num_envs=7") == 2
-    assert "not finished: ppo/seed_0" in capfd.readouterr().err
+    printed = capfd.readouterr()
+    assert "not finished: ppo/seed_0" in printed.err
+    assert "ppo/seed_0: not finished: num_envs=7 times algo.num_unrolls=1 must be a multiple of" in printed.out
     assert "choose num_envs a multiple of" in (tmp_path / "out" / "logs" / "ppo" / "seed_0.txt").read_text()
 
 
