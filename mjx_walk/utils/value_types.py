@@ -1,7 +1,6 @@
 """Whether a value has the type of its setting, in the words of a command line."""
 
 import dataclasses
-import numbers
 import os
 import re
 import types
@@ -15,8 +14,8 @@ __all__ = ["plain_type", "type_mistake", "type_problem", "with_whole_number"]
 
 _PLAIN = {
     bool: ("must be true or false", (bool, np.bool_)),
-    int: ("must be an integer", (numbers.Integral,)),
-    float: ("must be a number", (numbers.Real,)),
+    int: ("must be an integer", (typing.SupportsIndex,)),
+    float: ("must be a number", (typing.SupportsFloat,)),
     str: ("must be a string", (str, os.PathLike)),
 }
 """For each type of a setting, what is said of other values, and the types of valid ones."""
@@ -53,7 +52,7 @@ def type_problem(value: Any, hint: Any) -> str | None:
         return None if isinstance(value, kind) else _must_be(kind)  # type: ignore[arg-type]
     if typing.get_origin(kind) is tuple:
         items, length = _items(kind)
-        is_list = isinstance(value, list | tuple) and length in (None, len(value))
+        is_list = isinstance(value, list | tuple | np.ndarray) and length in (None, len(value))
         return None if is_list and not any(type_problem(item, items) for item in value) else _must_be(kind)
     return None
 

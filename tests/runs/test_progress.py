@@ -98,7 +98,7 @@ def test_a_bar_says_that_the_replay_is_filled(lines, monkeypatch):
     assert "left" not in last_bar(terminal)
     shown.update(row(3_000, 50.0, **{"train/critic_updates": 8.0}))
     shown.close()
-    assert "filling the replay:  20%" in terminal.getvalue() and "training:  30%" in last_bar(terminal)
+    assert "filling the replay:  10%" in terminal.getvalue() and "training:  30%" in last_bar(terminal)
 
 
 @pytest.mark.parametrize(
