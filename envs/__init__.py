@@ -19,6 +19,7 @@ from mjx_walk.envs.task_options import TaskOptions, with_absolute_paths
 from mjx_walk.envs.view import View
 from mjx_walk.utils.compat import prepare_jax
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.near_misses import unknown
 from mjx_walk.utils.settings import validate
 
 __all__ = [
@@ -60,15 +61,15 @@ def make_options(name: str, **kwargs: Any) -> TaskOptions:
     Raises:
         UserError: an unknown name or option, or an invalid value.
     """
-    if name not in TASKS:
-        raise UserError(f"unknown env '{name}'; choose one of: {', '.join(TASKS)}")
+    if not isinstance(name, str) or name not in TASKS:
+        raise UserError(unknown("env", str(name), TASKS))
     options_class = TASKS[name][1]
     known = [field.name for field in dataclasses.fields(options_class) if field.name not in ("name", "task")]
     for option in kwargs:
         if option not in known:
             near = difflib.get_close_matches(option, known, n=1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            raise UserError(f"{name} has no option '{option}'; {hint}valid: {', '.join(known)}")
-    options = with_absolute_paths(options_class(**kwargs), Path.cwd())
+            hint = f"did you mean '{near[0]}'?" if near else f"valid: {', '.join(known)}"
+            raise UserError(f"{name} has no option '{option}'; {hint}")
+    options = options_class(**kwargs)
     validate(options)
-    return options
+    return with_absolute_paths(options, Path.cwd())

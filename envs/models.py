@@ -1,6 +1,7 @@
 """MuJoCo models: where `xml_file` finds one, loading it, and looking up its parts."""
 
 import logging
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -12,9 +13,13 @@ from jaxtyping import Int
 
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import user_path
+from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.quiet_mujoco import hide_deprecations
 
 _LOGGER = logging.getLogger(__name__)
+
+_ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+"""Gymnasium's models."""
 
 
 class ModelNeeds(NamedTuple):
@@ -33,7 +38,7 @@ def model_path(xml_file: str) -> Path:
     """Path of a model. A bare name is one of Gymnasium's assets, even if the working directory has such a file."""
     path = user_path(xml_file)
     if len(path.parts) == 1:
-        return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / xml_file
+        return _ASSETS / xml_file
     return path
 
 
@@ -48,14 +53,34 @@ def load_model(xml_file: str) -> mujoco.MjModel:
     """
     path = model_path(xml_file)
     if not path.is_file():
-        raise UserError(f"model file not found: {path}")
+        raise UserError(_not_found(str(xml_file), path))
     if "\\" in str(path):
         raise UserError(f"MuJoCo cannot open {path}: it takes the backslash for a separator; choose another path")
     try:
         with hide_deprecations():
             return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        raise UserError(f"MuJoCo cannot read {path}: {str(error).splitlines()[0]}") from error
+        raise UserError(f"MuJoCo cannot read {path}: {_in_one_line(str(error))}") from error
+
+
+def _not_found(xml_file: str, path: Path) -> str:
+    """The error for a model file that does not exist."""
+    if path.is_dir() or user_path(xml_file).is_dir():
+        return f"model file not found: {xml_file} is a folder; write the path of an XML file"
+    if path.parent != _ASSETS:
+        return f"model file not found: {path}"
+    near = near_misses(xml_file, sorted(asset.name for asset in _ASSETS.glob("*.xml")))
+    hint = f"; did you mean: {', '.join(near)}?" if near else ""
+    return f"model file not found: {xml_file} is neither in this folder nor one of Gymnasium's models{hint}"
+
+
+def _in_one_line(error: str) -> str:
+    """MuJoCo's error. Its first line may name only a number; further ones have the cause and the line of the file."""
+    parser = re.search(r"ErrorID=\d+ \(0x\w+\) Line number=(\d+)", error)
+    reason = re.search(r"Error=XML_ERROR_(\w+)", error)
+    if parser and reason:
+        return f"it is not valid XML; see line {parser[1]} ({reason[1].replace('_', ' ').lower()})"
+    return "; ".join(line.strip() for line in error.splitlines() if line.strip())
 
 
 def body_id(model: mujoco.MjModel, body: int | str) -> int:
@@ -89,7 +114,8 @@ def check_model(model: mujoco.MjModel, task: str, needs: ModelNeeds) -> None:
         ("site(s)", needs.sites, model.nsite),
     ):
         if found < needed or (needs.is_exact and found > needed and name != "site(s)"):
-            raise UserError(f"{task} needs a model with {least} {needed} {name}; this one has {found}")
+            has = found or "no joints" if name.startswith("positions") else found
+            raise UserError(f"{task} needs a model with {least} {needed} {name}; this one has {has}")
     if not model.nu:
         raise UserError(f"{task} needs a model with motors; this one has no <actuator>")
     if model.nu != model.nactuator:

@@ -1,5 +1,6 @@
 """Reward functions and tasks from Python files, and the helper modules beside them."""
 
+import ast
 import hashlib
 import importlib.abc
 import importlib.machinery
@@ -222,6 +223,9 @@ def load_from_file(key: str, source: str, kind: str) -> UserFile:
     """
     path, name = source_path(source), source.rpartition(":")[2]
     problem = f"{key}={source}: "
+    unnamed = source.rstrip(":")
+    if unnamed.endswith(".py") and user_path(unnamed).is_file():
+        raise UserError(f"{problem}it names no {kind.lower()}; write {unnamed}:{kind}{_defined_in(unnamed, kind)}")
     if not path.is_file():
         given = source.rpartition(":")[0] or source
         raise UserError(f"{problem}no file '{given}'; write PATH.py:{kind}")
@@ -230,7 +234,19 @@ def load_from_file(key: str, source: str, kind: str) -> UserFile:
     try:
         return UserFile(path, name, kind.lower())
     except UserError as error:
-        raise UserError(f"{problem}{error}") from error
+        defined = "" if str(error).startswith(f"{path} is new") else _defined_in(path, kind)
+        raise UserError(f"{problem}{error}{defined}") from error
     except (Exception, SystemExit) as error:
         reason = str(error).splitlines()[0] if str(error) else ""
         raise UserError(f"{problem}{type(error).__name__}: {reason}") from error
+
+
+def _defined_in(path: str | Path, kind: str) -> str:
+    """Names of the functions or classes of a Python file, for messages; the file is read and not run."""
+    wanted = ast.ClassDef if kind == "CLASS" else ast.FunctionDef
+    try:
+        body = ast.parse(user_path(path).read_bytes()).body
+    except (OSError, SyntaxError, ValueError, RecursionError):
+        return ""
+    names = [node.name for node in body if isinstance(node, wanted) and not node.name.startswith("_")]
+    return f"; it defines: {', '.join(names)}" if names else ""

@@ -11,6 +11,24 @@ from mjx_walk.utils.versions import __version__
 COMMANDS = ("train", "eval", "play", "plots", "export", "zoo", "compare", "bench", "parity")
 _PACKAGES = ("zoo",)
 """Commands that are packages."""
+_OTHER_NAMES = {
+    "benchmark": "bench",
+    "draw": "plots",
+    "enjoy": "play",
+    "evaluate": "eval",
+    "learn": "train",
+    "list": "zoo",
+    "record": "play",
+    "render": "play",
+    "score": "eval",
+    "test": "eval",
+    "v": "--version",
+    "version": "--version",
+    "video": "play",
+    "view": "play",
+    "watch": "play",
+}
+"""Our commands for the names that other tools have for them."""
 
 
 def main() -> int:
@@ -23,9 +41,9 @@ def main() -> int:
         print(f"mjx_walk {__version__}")
         return 0
     if command not in COMMANDS:
-        near = difflib.get_close_matches(command, COMMANDS, 1, cutoff=0.7)
-        meant = f"train {command}" if "=" in command else near[0] if near else ""
-        hint = f"did you mean: {meant}?" if meant else f"choose one of: {', '.join(COMMANDS)}"
+        meant = _meant(command)
+        first = "the command comes first; " if command.startswith("-") else ""
+        hint = f"did you mean: {meant}?" if meant else f"{first}choose one of: {', '.join(COMMANDS)}"
         print(f"error: unknown command '{command}'; {hint}", file=sys.stderr)
         return 2
     from mjx_walk.utils import cli  # imports JAX, which the list of commands does not need
@@ -33,6 +51,17 @@ def main() -> int:
     module = importlib.import_module(f"mjx_walk.{_module(command)}")
     sys.argv = [f"mjx-walk {command}", *arguments]
     cli.main(module.main)
+
+
+def _meant(argument: str) -> str:
+    """What may be meant by an argument in the place of the command, or nothing."""
+    key, equals, _ = argument.lstrip("-").partition("=")
+    if argument.startswith("zoo:"):
+        return f"play run={argument}"
+    if equals and not argument.startswith("-"):
+        return f"play {argument}" if key == "run" else f"train {argument}"
+    near = difflib.get_close_matches(key.lower(), (*COMMANDS, *_OTHER_NAMES), 1, cutoff=0.7)
+    return _OTHER_NAMES.get(near[0], near[0]) if near else ""
 
 
 def usage() -> str:

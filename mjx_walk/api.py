@@ -6,10 +6,10 @@ import functools
 import logging
 import operator
 import shlex
+import typing
 from collections.abc import Callable
 from pathlib import Path
 
-import jax
 import yaml
 
 from mjx_walk import zoo
@@ -18,11 +18,18 @@ from mjx_walk.envs import BUILT_IN_TASKS, Task, register_task
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.envs.registry import task_name
 from mjx_walk.envs.user_files import only_known, source_path
-from mjx_walk.evaluation.gymnasium_scores import Episodes, compile_episodes, score_in_gymnasium, score_in_sim
+from mjx_walk.evaluation.gymnasium_scores import (
+    Episodes,
+    ScoreRequest,
+    compile_episodes,
+    score_in_gymnasium,
+    score_in_sim,
+)
 from mjx_walk.runs import run_folder
 from mjx_walk.runs.config import Config, load_config
 from mjx_walk.runs.loggers import require_wandb
 from mjx_walk.runs.metrics import Row, read_rows
+from mjx_walk.runs.overrides import key_of_value
 from mjx_walk.runs.own_tasks import KEY
 from mjx_walk.runs.policies import SavedPolicy, make_task
 from mjx_walk.runs.preparation import prepared
@@ -32,11 +39,14 @@ from mjx_walk.runs.saved_config import read_saved_config, with_setting
 from mjx_walk.runs.saved_yaml import read_yaml
 from mjx_walk.runs.scores import BEST, Scores
 from mjx_walk.runs.trust import remember, require_trusted
+from mjx_walk.training.announcement import announce
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.memory_check import check_replay
 from mjx_walk.training.trainer import Trainer
+from mjx_walk.utils.cli import refuse_flags
 from mjx_walk.utils.compat import prepare_jax, standard_settings, temporary_jax_settings
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.settings import validate
 from mjx_walk.utils.signals import as_by_ctrl_c
 from mjx_walk.viewing.rendering import choose_opengl
 
@@ -63,7 +73,11 @@ class Run(SavedPolicy):
                 Gymnasium's reward, `sim` with the run's shaping. A run's `reward_function` is not loaded. A task of
                 your own has no equal in Gymnasium: both backends score it in the engine.
             seed: seed of the resets.
+
+        Raises:
+            UserError: an invalid argument.
         """
+        validate(ScoreRequest(episodes, backend, seed))
         if backend == "gymnasium" and self.task.is_in_gymnasium:
             return score_in_gymnasium(self.task, self.act, episodes, seed)
         if self.reward_function:
@@ -184,7 +198,7 @@ def _prepare(
     folders: list[RunFolder] = []
     if processes.is_main_process:
         folders, configs = locks.enter_context(prepared(configs))
-        _announce(configs[0], folders, processes.process_count)
+        announce(configs[0], folders, processes.process_count)
         if replay:
             _LOGGER.info(replay)
     if processes.process_count > 1:
@@ -232,7 +246,10 @@ def run(
         UserError: invalid overrides, or a run that cannot be trained here.
     """
     prepare_jax()
-    overrides = list(overrides or [])
+    if isinstance(overrides, str | dict):
+        raise UserError(f"overrides={overrides!r}: give a list, such as ['env=walker2d', 'seed=1']")
+    overrides = [str(override) for override in overrides or []]
+    refuse_flags(overrides, key_of_value, typing.get_type_hints(Config))
     if task is not None:
         overrides = _with_task(overrides, task)
     folders, _ = train([resolve(overrides)], on_metrics)
@@ -244,6 +261,8 @@ def _with_task(overrides: list[str], task: type[Task]) -> list[str]:
     for override in overrides:
         if override.partition("=")[0] in ("env", KEY):
             raise UserError(f"give task= or {override}, not both")
+    if isinstance(task, str):
+        raise UserError(f"task={task!r}: give a class; for a task by its name, add 'env={task}' to the overrides")
     name = task_name(task)
     register_task(name, task)
     return overrides if "resume=true" in overrides else [f"env={name}", *overrides]
@@ -272,28 +291,3 @@ def _as_saved(config: Config, overrides: list[str]) -> Config:
     for key in given - {"hardware"} | {"run_dir", "resume"}:
         saved = with_setting(saved, key, operator.attrgetter(key)(config))
     return saved
-
-
-def _announce(config: Config, folders: list[RunFolder], num_devices: int) -> None:
-    """Log what is trained where, and what may surprise the user."""
-    device = jax.devices()[0]
-    where = device.device_kind if device.platform != "cpu" else "the CPU"
-    where = where if num_devices == 1 else f"{num_devices} × {where}, one process each"
-    path = folders[0].path if len(folders) == 1 else f"{len(folders)} folders of {folders[0].path.parent}"
-    env, algo = config.env.name, config.algo
-    _LOGGER.info("Training %s with %s on %s, physics=%s, in %s", env, algo.name, where, config.physics, path)
-    if config.hardware == "cpu":
-        _LOGGER.info(
-            "No accelerator: this is the recipe for a CPU. By default the physics is MuJoCo's C library. "
-            "Expect a gait after minutes to tens of minutes; recipes for a GPU reach much higher scores."
-        )
-    if algo.learning_rate_schedule != "constant" and config.total_steps > algo.schedule_steps:
-        _LOGGER.warning(
-            "after algo.schedule_steps=%d the learning rate is zero; to learn until total_steps=%d, "
-            "add algo.schedule_steps=%d",
-            algo.schedule_steps,
-            config.total_steps,
-            config.total_steps,
-        )
-    if config.physics == "warp":
-        _LOGGER.info("On the first run on a machine, Warp compiles its kernels, which takes about a minute.")

@@ -6,6 +6,7 @@
 import dataclasses
 import functools
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -66,11 +67,13 @@ def main(command_line: list[str]) -> int:
         return 0
     if not arguments.algos:
         raise UserError(f"algos=[]: choose some of: {', '.join(ALGORITHMS)}")
+    if arguments.out is not None and user_path(arguments.out).is_file():
+        raise UserError(f"out={arguments.out} is a file; give a folder")
     seeds = cli.read_seeds(arguments.seeds)
     hardware, available = count_devices()
     count = arguments.devices or available
     if count > available:
-        raise UserError(f"devices={count}: this machine has {available}")
+        raise UserError(f"devices={count}: this machine has {available}; leave it out to use all")
     options = (overrides, list(arguments.algos), seeds, arguments.out, hardware)
     out, planned = plan_suite(arguments.suite, *options) if arguments.suite else planned_runs.plan(*options)
     unfinished = [run for run in planned if not run.is_finished]
@@ -85,7 +88,7 @@ def main(command_line: list[str]) -> int:
         slots,
         out / "logs",
         functools.partial(_on_end, out),
-        lambda run: print(f"  {run.name}: {run.progress}", flush=True),
+        _on_progress,
     )
     if signal_name:
         print(f"Stopped by {signal_name}. Run the same command to resume.")
@@ -104,15 +107,22 @@ def _on_progress(run: PlannedRun) -> None:
 def _on_end(out: Path, run: PlannedRun, log: Path) -> None:
     """Print how a run has ended, and update the report."""
     if not run.is_finished:
-        is_out_of_memory = "RESOURCE_EXHAUSTED" in log.read_text(errors="replace")[-10_000:]
-        hint = "; memory ran out, so try together=1 or a smaller num_envs" if is_out_of_memory else ""
-        print(f"{run.name}: not finished; see {log}{hint}", flush=True)
+        print(f"{run.name}: not finished{_reason(log)}; see {log}", flush=True)
         return
     print(f"{run.name}: finished", flush=True)
     try:
         write_report(out)
     except (UserError, OSError, ValueError) as error:  # the other runs continue
         print(f"warning: {out} could not be drawn: {error}", file=sys.stderr)
+
+
+def _reason(log: Path) -> str:
+    """Why a job has ended: the line of its error, or of its exception."""
+    text = log.read_text(errors="replace")[-10_000:]
+    if "RESOURCE_EXHAUSTED" in text:
+        return ": memory ran out, so try together=1 or a smaller num_envs"
+    found = re.findall(r"^(?:error: (.+)|([\w.]+(?:Error|Exception)\b.*))$", text, re.MULTILINE)
+    return f": {''.join(found[-1])}" if found else ""
 
 
 def _print_report(out: Path) -> None:

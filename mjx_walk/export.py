@@ -44,9 +44,10 @@ def main(command_line: list[str]) -> None:
         from mjx_walk.interop.onnx import translate
     except ImportError as error:
         raise UserError("format=onnx needs ONNX: pip install onnx") from error
-    run = load_run(folder.path, "c", arguments.policy)
     path = user_path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.onnx")
+    cli.check_suffix(path, ".onnx")
     cli.check_writable(path)
+    run = load_run(folder.path, "c", arguments.policy)
     name = f"{run.config.env.name}_{run.config.algo.name}"
     model = translate(run.act, run.task.observation_size, name, arguments.dtype)
     with replacing(path) as new:

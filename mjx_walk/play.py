@@ -9,6 +9,7 @@ from mjx_walk.api import load_run
 from mjx_walk.runs.own_tasks import take_task
 from mjx_walk.runs.scores import BEST, POLICIES
 from mjx_walk.utils import cli
+from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import replacing, user_path
 from mjx_walk.utils.settings import setting
 from mjx_walk.viewing.episode import record_episode
@@ -27,10 +28,14 @@ usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [policy=best|final] [seed=0]
   html=FILE.html  a page that plays the episode in 3D with its reward terms, in any browser, offline (pip install
                   meshcat)
   gait=FILE.png   a gait sheet: frames, height and speed of a body, floor contacts, motors, reward terms
-  strip=FILE.png  eight frames side by side, over `seconds` from `start`
+  strip=FILE.png  eight frames side by side, over `seconds` from `start`, both in seconds
   env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
   viewer=true     MuJoCo's live viewer, which needs a screen; it plays episodes until it is closed
 """
+
+
+_START, _SECONDS = 5.0, 1.0
+"""Part of the episode that a strip shows, s."""
 
 
 @dataclasses.dataclass
@@ -41,8 +46,8 @@ class Arguments:
     html: str | None = None
     gait: str | None = None
     strip: str | None = None
-    start: float = setting(5.0, at_least=0)
-    seconds: float = setting(1.0, above=0)
+    start: float | None = setting(None, at_least=0)
+    seconds: float | None = setting(None, above=0)
     viewer: bool = False
     seed: int = setting(0, at_least=0)
     width: int = setting(640, at_least=64, at_most=4096)
@@ -54,6 +59,9 @@ def main(command_line: list[str]) -> None:
     arguments = cli.parse(Arguments, take_task(command_line), USAGE)
     cli.stay_on_cpu()
     folder = zoo.open_run(arguments.run)
+    for key in ("start", "seconds"):
+        if getattr(arguments, key) is not None and arguments.strip is None:
+            raise UserError(f"{key}={getattr(arguments, key):g} needs strip=FILE.png, the image that it is for")
     if arguments.html:
         require_library()
     paths = (arguments.out, arguments.html, arguments.gait, arguments.strip)
@@ -61,6 +69,7 @@ def main(command_line: list[str]) -> None:
     if not (any(paths) or arguments.viewer):
         film = zoo.output_path(folder, "episode.mp4")
     cli.check_suffix(film, ".mp4", ".mkv", ".mov", ".avi")
+    cli.check_suffix(html, ".html", ".htm")
     for image in (gait, strip):
         cli.check_suffix(image, ".png", ".jpg")
     written = [path for path in (film, html, gait, strip) if path]
@@ -70,6 +79,7 @@ def main(command_line: list[str]) -> None:
     if written:
         size = None if written == [html] else (arguments.width, arguments.height)
         episode = record_episode(run.task, run.policy, arguments.seed, size)
+        shown = _shown(arguments, float(episode.seconds[-1]))
         print(f"{episode.env}: return {episode.rewards.sum():,.1f} in {len(episode.rewards)} steps")
         if film:
             write_film(episode.frames, film, episode.frames_per_second)
@@ -79,10 +89,25 @@ def main(command_line: list[str]) -> None:
             draw_gait_sheet(episode, gait)
         if strip:
             with replacing(strip) as new:
-                iio.imwrite(new, frame_strip(episode, arguments.start, arguments.seconds))
+                iio.imwrite(new, frame_strip(episode, *shown))
         print(*written, sep="\n")
     if arguments.viewer:
         show(run.task, run.policy, arguments.seed)
+
+
+def _shown(arguments: Arguments, length: float) -> tuple[float, float]:
+    """Start and length of the strip, s. By default it begins earlier in an episode that is shorter than five seconds.
+
+    Raises:
+        UserError: the given start is past the end of the episode.
+    """
+    if arguments.start is not None and arguments.start >= length:
+        raise UserError(
+            f"start={arguments.start:g} is past the end of the episode, which lasts {length:.2f} s; give a smaller one"
+        )
+    seconds = _SECONDS if arguments.seconds is None else arguments.seconds
+    start = min(_START, max(0.0, length - seconds)) if arguments.start is None else arguments.start
+    return start, seconds
 
 
 if __name__ == "__main__":

@@ -24,7 +24,8 @@ def main(command_line: list[str]) -> None:
     folder = zoo.open_run(cli.parse(Arguments, command_line, USAGE).run)
     written = plot_run(folder)
     if not written:
-        raise UserError(f"{folder.path} has no metrics to draw")
+        reason = "the zoo keeps no metrics" if zoo.holds(folder.path) else "it has not logged any metrics yet"
+        raise UserError(f"{folder.path} cannot be drawn: {reason}; give a run that has trained")
     print(*written, sep="\n")
 
 

@@ -5,6 +5,7 @@ import os
 import sys
 import textwrap
 import traceback
+import typing
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,8 @@ usage: python -m mjx_walk.train [env=humanoid] [algo=ppo] [KEY=VALUE ...]
 """
 
 _HYDRAS_FLAGS_WITH_VALUE = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--experimental-rerun")
+_PRINTED = ("job", "hydra", "all")
+"""Values of `--cfg`."""
 _HYDRAS_OTHER_FLAGS = ("--multirun", "-m", "--resolve", "--hydra-help", "--shell-completion", "-sc")
 
 
@@ -136,17 +139,34 @@ def _without_hydras(arguments: list[str]) -> list[str]:
     ]
 
 
+def _check_cfg(arguments: list[str]) -> None:
+    """Check the value of `--cfg`, about which Hydra prints several lines.
+
+    Raises:
+        UserError: it is missing or unknown.
+    """
+    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        flag, equals, value = argument.partition("=")
+        if flag in ("--cfg", "-c") and (value if equals else following) not in _PRINTED:
+            raise UserError(f"{flag} prints a configuration; write --cfg job, --cfg hydra or --cfg all")
+
+
 def _through_hydra(arguments: list[str]) -> None:
     """Pass flags to Hydra: sweeps, launchers, `--cfg`.
 
     Raises:
         UserError: Hydra refuses the arguments.
     """
-    cli.refuse_flags(_without_hydras(arguments), key_of_value)
+    hints = typing.get_type_hints(Config) | typing.get_type_hints(Own)
+    cli.refuse_flags(_without_hydras(arguments), key_of_value, hints)
+    _check_cfg(arguments)
     given = [a for a in arguments if not a.startswith("-") and ("=" in a or a.startswith(("+", "~")))]
     flags = [argument for argument in arguments if argument not in given]
     overrides = complete_overrides(given, is_sweep=bool({"-m", "--multirun"} & {*flags}))
     parsed = OverridesParser.create().parse_overrides(overrides)
+    for override in parsed:
+        if override.is_sweep_override() and not any(True for _ in override.sweep_iterator()):
+            raise UserError(f"{override.input_line} gives no value; give one, or several with commas")
     plain = [o for o in parsed if not o.is_sweep_override() and not o.key_or_group.startswith("hydra")]
     # Reports errors in one line, where Hydra takes several. A swept setting may enable others.
     check = compose_config if any(o.is_sweep_override() for o in parsed) else load_config

@@ -23,16 +23,16 @@ from mjx_walk.utils.errors import UserError
 
 CASES = [
     (["env=snake"], f"unknown env 'snake'; choose one of: {', '.join(TASKS)}"),
-    (["env=[ant]"], "unknown env '['ant']'; choose one of: humanoid"),
+    (["env=[ant]"], "unknown env '['ant']'; did you mean: ant?"),
     (["algo={a:b}"], "unknown algo '{'a': 'b'}'; choose one of: ppo"),
-    (["-m", ""], "mismatched input '<EOF>' expecting"),
+    (["-m", ""], "an argument is empty; write KEY=VALUE"),
     (["seed=1", "seeds=2"], "give seed=N or seeds=[…], not both"),
     (["seeds=[1,1]"], "seeds=[1, 1]: give a number of seeds, or a list of different seeds from 0 up"),
     (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo, sac, csac, td3, ddpg, a2c, reinforce"),
     (["physics=bullet"], "physics=bullet: choose one of: auto, warp, jax, c"),
     (["env.version=v3"], "env.version=v3: choose one of: v5, v4"),
     (["recipe=nope"], "recipes for env=humanoid algo=ppo: cpu/humanoid_ppo, gpu/humanoid_ppo"),
-    (["recipe=report/e_td3", "algo=sac"], "this recipe does not fit the given env and algo"),
+    (["recipe=report/e_td3", "algo=sac"], "recipe=report/e_td3 does not fit env=humanoid algo=sac; add algo=td3"),
     (["device=2"], "unknown key 'device'; did you mean: devices?"),
     (["seedz=2"], "unknown key 'seedz'; did you mean: seed, seeds?"),
     (["num_env=4"], "unknown key 'num_env'; did you mean: num_envs"),
@@ -45,10 +45,10 @@ CASES = [
     (["env", "humanoid"], "cannot read 'env humanoid'; write env=humanoid"),
     (["--num_envs", "5"], "cannot read '--num_envs 5'; write num_envs=5"),
     (["--num-envs=5"], "cannot read '--num-envs=5'; write num_envs=5"),
-    (["--resume", "seed=1"], "cannot read '--resume'; write resume=VALUE"),
+    (["--resume", "seed=1"], "cannot read '--resume'; write resume=true"),
     (["-m", "seed=0,1", "--env", "humanoid"], "cannot read '--env humanoid'; write env=humanoid"),
     (["runs/x"], "cannot read 'runs/x'; write KEY=VALUE"),
-    (["num_envs=many"], "num_envs: Value 'many' of type 'str' could not be converted to Integer"),
+    (["num_envs=many"], "num_envs=many: must be an integer"),
     (["num_envs=0"], "num_envs=0: must be at least 1"),
     (["total_steps=-5"], "total_steps=-5: must be at least 1"),
     (["algo.learning_rate=nan"], "algo.learning_rate=nan: must be a number"),
@@ -211,10 +211,12 @@ def test_resume_names_the_keys_that_differ(finished):
     assert "algo.discount (was 0.99, now 0.5)" in str(error.value) and "seed (was 0, now 9)" in str(error.value)
     with pytest.raises(UserError) as error:
         train_command.main([f"run_dir={finished}", "resume=true", "checkpoint.keep=5"])
-    assert ": checkpoint.keep (was 3, now 5); with run_dir and resume=true alone it continues" in str(error.value)
+    assert ": checkpoint.keep (was 3, now 5); give only run_dir and resume=true to continue" in str(error.value)
     with pytest.raises(UserError, match="may only grow"):
         train_command.main([*same[:-1], f"total_steps={TINY_CALL}"])
-    with pytest.raises(UserError, match=r"config\.yaml: env\.name \(was walker2d, now humanoid\); and \d+ more; with "):
+    with pytest.raises(
+        UserError, match=r"other settings: env\.name \(was walker2d, now humanoid\); and \d+ more; give "
+    ):
         train_command.main([*same, "env=humanoid"])
 
 

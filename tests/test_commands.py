@@ -57,6 +57,15 @@ def test_a_command_gets_its_arguments(monkeypatch, capsys):
     [
         ("trai", "did you mean: train?"),
         ("env=humanoid", "did you mean: train env=humanoid?"),
+        ("evaluate", "did you mean: eval?"),
+        ("watch", "did you mean: play?"),
+        ("run=x", "did you mean: play run=x?"),
+        ("zoo:humanoid-csac", "did you mean: play run=zoo:humanoid-csac?"),
+        ("-v", "did you mean: --version?"),
+        (
+            "--env",
+            "the command comes first; choose one of: train, eval, play, plots, export, zoo, compare, bench, parity",
+        ),
         ("fly", "choose one of: train, eval, play, plots, export, zoo, compare, bench, parity"),
     ],
 )

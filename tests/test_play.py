@@ -78,7 +78,7 @@ def test_play_prints_a_one_line_error(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     (tmp_path / "file").write_text("")
     for arguments, message in (
-        ((), "say which run: run=RUN_DIR or run=zoo:NAME; python -m mjx_walk.zoo lists the names"),
+        ((), "say which run: run=RUN_DIR, or run=zoo:NAME; python -m mjx_walk.zoo lists the names"),
         (("run=nowhere",), "no run at 'nowhere'"),
         (("run=zoo:walker2d-sac", f"out={tmp_path}/file/walk.mp4"), f"cannot write {tmp_path}/file/walk.mp4"),
         (("run=zoo:walker2d-sac", f"html={tmp_path}/file/walk.html"), f"cannot write {tmp_path}/file/walk.html"),

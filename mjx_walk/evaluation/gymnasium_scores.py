@@ -1,6 +1,7 @@
 """Scores of a policy: in the real Gymnasium, or in a run's own engine."""
 
 import contextlib
+import dataclasses
 import os
 import pickle
 from collections.abc import Callable
@@ -13,12 +14,25 @@ import numpy as np
 from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
 from mjx_walk.evaluation.gymnasium_worker import send
+from mjx_walk.runs.progress import ScoringProgress
 from mjx_walk.runs.scores import Scores
+from mjx_walk.utils.settings import setting
 from mjx_walk.utils.subprocesses import start_module
 from mjx_walk.utils.types import PolicyFn
 
 _MAX_PARALLEL_EPISODES = 1024
 """Episodes played at once; an environment takes about 1 MB."""
+
+
+@dataclasses.dataclass
+class ScoreRequest:
+    """What a user asks to be scored."""
+
+    episodes: int = setting(100, at_least=1)
+    backend: str = setting("gymnasium", choices=("gymnasium", "sim"))
+    seed: int = setting(0, at_least=0)
+
+
 Episodes = Callable[[jax.Array, int], tuple[jax.Array, jax.Array]]
 """`key, N → returns [N] f32, lengths [N] i32`."""
 
@@ -38,14 +52,17 @@ def score_in_gymnasium(task: Task, act: Callable[[Any], Any], num_episodes: int,
         return score_in_sim(task, compile_episodes(task, lambda obs, key: act(obs)), num_episodes, seed)
     seeds = [seed + i for i in range(num_episodes)]
     rounds = [seeds[i : i + _MAX_PARALLEL_EPISODES] for i in range(0, num_episodes, _MAX_PARALLEL_EPISODES)]
-    returns, lengths = zip(*(_play_in_gymnasium(task, act, some) for some in rounds), strict=True)
+    with contextlib.closing(ScoringProgress(num_episodes, len(rounds) * task.max_episode_steps)) as progress:
+        played = [_play_in_gymnasium(task, act, some, progress, number) for number, some in enumerate(rounds)]
+    returns, lengths = zip(*played, strict=True)
     return Scores(np.concatenate(returns), np.concatenate(lengths), seeds, task.gymnasium_id)
 
 
 def _play_in_gymnasium(
-    task: Task, act: Callable[[np.ndarray], np.ndarray], seeds: list[int]
+    task: Task, act: Callable[[np.ndarray], np.ndarray], seeds: list[int], progress: ScoringProgress, rounds_before: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Play one episode per seed, all in parallel; their returns and lengths."""
+    steps_before = rounds_before * task.max_episode_steps
     keywords = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
     returns, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), np.int64)
     is_over = np.zeros(len(seeds), bool)
@@ -66,6 +83,8 @@ def _play_in_gymnasium(
             for worker, share in zip(workers, shares, strict=True):
                 obs[share], rewards, is_over[share] = _receive(worker)
                 returns[share] += rewards
+            num_before = rounds_before * _MAX_PARALLEL_EPISODES
+            progress.update(steps_before + int(lengths.max()), num_before + int(is_over.sum()))
     return returns, lengths
 
 

@@ -116,7 +116,7 @@ def plan(
             raise UserError(f"two variants would share the folder {run_dir}; compare them in two comparisons")
     environments = {f"{run.config.env.name} {run.config.env.version}" for run in runs.values()}
     if len(environments) > 1:
-        raise UserError(f"one comparison is of one environment, not of {', '.join(sorted(environments))}")
+        raise UserError(f"a comparison has one environment; these are several: {', '.join(sorted(environments))}")
     for run in runs.values():
         _check_same_configuration(run)
     return folder, list(runs.values())
@@ -124,13 +124,16 @@ def plan(
 
 def _choices(overrides: list[str], hardware: str) -> list[list[str]]:
     """The alternatives of each override: several for one with commas, else one."""
-    reserved = {"algo": "algos=[…]", "seed": "seeds=N", "run_dir": "out=DIR", "resume": "nothing: it always resumes"}
+    reserved = {"algo": "write 'algos=[{}]'", "seed": "write seeds=[{}]", "run_dir": "write out={}"}
+    reserved["resume"] = "leave it out, since finished and interrupted runs are kept"
     choices = []
     completed = complete_overrides([f"hardware={hardware}", *overrides], is_sweep=True)
     for override in OverridesParser.create().parse_overrides(completed):
         key, text = override.key_or_group, str(override.input_line)
         if key in reserved:
-            raise UserError(f"'{text}': in a comparison write {reserved[key]}")
+            raise UserError(f"'{text}': in a comparison {reserved[key].format(text.partition('=')[2])}")
+        if key == "env" and override.is_sweep_override():
+            raise UserError(f"'{text}': a comparison has one environment; give one of them, or suite=mujoco for all")
         if override.is_sweep_override() and not override.is_choice_sweep():
             raise UserError(f"'{text}': list the values, {key}=A,B")
         is_swept = override.is_sweep_override()

@@ -54,7 +54,7 @@ def plan_suite(
     """
     for override in overrides:
         if override.partition("=")[0] in ("env", "env.name"):
-            raise UserError(f"'{override}': suite={suite} has its own environments; leave one of both out")
+            raise UserError(f"'{override}': suite={suite} has its own environments; leave out one of the two")
     folder = user_path(out or f"runs/compare_{suite}")
     runs = []
     for env in SUITES[suite]:

@@ -17,6 +17,7 @@ from mjx_walk.interop.gymnasium_programs import make_programs, refuse_fork
 from mjx_walk.interop.gymnasium_sub_env import SubEnv
 from mjx_walk.interop.gymnasium_twin import RENDER_MODES, make_twin, physics_values, refuse_changes, split_keywords
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.value_types import type_problem
 
 _NOT_PICKLED = ("_twin", "_original", "_programs", "envs")
 
@@ -51,6 +52,8 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
             UserError: an unknown name, engine or keyword, or `render_mode="human"`.
         """
         refuse_fork()
+        if type_problem(num_envs, int) or num_envs < 1:
+            raise UserError(f"num_envs={num_envs}: must be an integer of at least 1")
         options, self._rendering = split_keywords(keywords)
         if self._rendering.get("render_mode") == "human":
             raise UserError(

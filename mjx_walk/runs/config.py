@@ -1,7 +1,6 @@
-"""The configuration of a run: its schema, and how command lines and files become one."""
+"""The configuration of a run: how a command line becomes one, and back."""
 
 import dataclasses
-import difflib
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,14 @@ from omegaconf.errors import OmegaConfBaseException
 from mjx_walk import envs
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
-from mjx_walk.envs.physics import ENGINES
+from mjx_walk.runs.mistakes import explain
 from mjx_walk.runs.overrides import complete_overrides
-from mjx_walk.runs.recipes import CONFIG_DIR, fitting_recipes, recipe_names
+from mjx_walk.runs.recipes import CONFIG_DIR, recipe_names
 from mjx_walk.runs.renamed import present_overrides
+from mjx_walk.runs.schema import CheckpointConfig, Config
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import user_path
-from mjx_walk.utils.settings import has_effect, refuse_ineffective, setting, validate
+from mjx_walk.utils.settings import has_effect, refuse_ineffective, validate
 
 __all__ = [
     "CONFIG_DIR",
@@ -38,53 +37,6 @@ __all__ = [
     "training_command",
     "with_absolute_paths",
 ]
-
-
-@dataclasses.dataclass
-class CheckpointConfig:
-    """Settings of checkpoints."""
-
-    every_calls: int = setting(50, at_least=1)
-    """Program calls from one checkpoint to the next."""
-    keep: int = setting(3, at_least=1)
-    """Number of newest checkpoints to keep. Several seeds or devices keep one more until training ends. The best policy
-    is kept separately."""
-
-
-@dataclasses.dataclass
-class Config:
-    """Settings of one training run."""
-
-    env: Any = None
-    """Options of the task, see `mjx_walk.envs`."""
-    algo: Any = None
-    """Settings of the algorithm, see `mjx_walk.algos`."""
-    hardware: str = setting("gpu", choices=("gpu", "cpu"))
-    """Size of the recipe. The default follows from the devices that JAX sees."""
-    physics: str = setting("auto", choices=("auto", *ENGINES))
-    """Physics engine, see `mjx_walk.envs.physics`."""
-    seed: int = setting(0, at_least=0, at_most=2**32 - 1)
-    """Seed of all random numbers of the run."""
-    num_envs: int = setting(8192, at_least=1, at_most=2**31 - 1)
-    """Training environments on each device."""
-    total_steps: int = setting(100_000_000, at_least=1)
-    """Environment steps, summed over all environments and rounded up to a multiple of the steps of a call."""
-    iterations_per_call: int = setting(1, at_least=1)
-    """Iterations compiled into one program call. Logging, filming and saving happen between calls. With a single
-    iteration, Warp records its kernels again in most calls, because arrays that the physics reads have moved."""
-    run_dir: str | None = None
-    """Folder of the run, by default `runs/ENV_ALGO/TIME`."""
-    resume: bool = False
-    """Continue the run in `run_dir` from its newest checkpoint."""
-    wandb_project: str | None = None
-    """Weights & Biases project to log to."""
-    profile_calls: int = setting(0, at_least=0)
-    """Program calls to record with JAX's profiler, from the third one on, in the run folder's `profile`. TensorBoard
-    and Perfetto show the recording."""
-    matmul_precision: str = setting("tensorfloat32", choices=("tensorfloat32", "float32"))
-    """Precision of the networks' matrix products. The physics always uses float32."""
-    evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
-    checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
 
 
 def register_schemas() -> None:
@@ -131,7 +83,7 @@ def compose_config(overrides: list[str]) -> Config:
             node = compose("train", overrides)
         return with_absolute_paths(to_config(node), Path.cwd())
     except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(_one_line(error, overrides)) from error
+        raise UserError(explain(error, overrides)) from error
 
 
 def to_config(node: Any) -> Config:
@@ -177,35 +129,6 @@ def flatten(config: Config) -> dict[str, Any]:
                 yield prefix + key, item
 
     return dict(walk(yaml.safe_load(OmegaConf.to_yaml(OmegaConf.structured(config))), ""))
-
-
-def _first_line(error: BaseException) -> str:
-    return next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-
-
-def _one_line(error: BaseException, overrides: list[str]) -> str:
-    """The part of a Hydra error that helps the user. The useful detail is often in its cause."""
-    texts = [str(error), str(error.__cause__ or "")]
-    if "raised while composing config" in texts[0]:  # the first line names the file, the second the problem
-        file, wrong = (line.strip() for line in texts[0].splitlines()[:2])
-        return f"{file.partition(':')[0]}: {wrong}; this recipe does not fit the given env and algo"
-    if any("not in struct" in text or "not in '" in text or "Could not override" in text for text in texts):
-        valid = list(
-            flatten(load_config([o for o in overrides if o.startswith(("env=", "algo=", "hardware=", "recipe="))]))
-        )
-        given = [override.split("=", 1)[0] for override in overrides]
-        unknown = [key for key in given if key not in valid and key not in ("env", "algo", "recipe", "hardware")]
-        if unknown:
-            near = difflib.get_close_matches(unknown[0], valid, n=3, cutoff=0.4)
-            section = unknown[0].rpartition(".")[0]
-            choices = near or [key for key in valid if key.rpartition(".")[0] == section] or valid
-            return f"unknown key '{unknown[0]}'; did you mean: {', '.join(choices)}?"
-    if "Could not find 'recipe/" in texts[0]:
-        chosen = dict(override.split("=", 1) for override in overrides if override.startswith(("env=", "algo=")))
-        return f"{_first_line(error)}; {fitting_recipes(chosen.get('env', 'humanoid'), chosen.get('algo', 'ppo'))}"
-    key = getattr(error, "full_key", None) or getattr(error.__cause__, "full_key", None)
-    detail = _first_line(error.__cause__ or error)
-    return f"{key}: {detail}" if key else detail
 
 
 def training_command(config: Config) -> str:

@@ -16,7 +16,10 @@ from mjx_walk.envs import TASKS, TaskOptions
 from mjx_walk.runs.own_tasks import KEY, name_task
 from mjx_walk.runs.recipes import base_recipe
 from mjx_walk.runs.renamed import present_overrides
+from mjx_walk.runs.schema import chosen, setting_types
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.near_misses import unknown
+from mjx_walk.utils.value_types import plain_type, with_whole_number
 
 __all__ = ["complete_overrides", "key_of_value", "sweep_choices"]
 
@@ -41,17 +44,20 @@ def complete_overrides(overrides: list[str], is_sweep: bool = False) -> list[str
     Raises:
         UserError: `+key`, `++key` or `~key`, a malformed override, or an unknown environment or algorithm.
     """
-    overrides = _with_named_task(present_overrides(overrides))
+    overrides = _with_whole_numbers(_with_named_task(present_overrides(overrides)))
     parsed = [_parse(override) for override in _quote_texts(overrides, is_sweep)]
     for override in parsed:
         key = override.key_or_group
         if key.startswith("hydra"):
             continue
         if override.is_add() or override.is_force_add() or override.is_delete():
-            raise UserError(f"'{override.input_line}': keys cannot be added or removed; write {key}=VALUE")
+            text = str(override.input_line)
+            value = text.partition("=")[2] or "VALUE"
+            raise UserError(f"'{text}': keys cannot be added or removed; write {key}={value}")
         known: Collection[str] | None = {"env": TASKS.keys(), "algo": ALGORITHMS.keys()}.get(key)
-        if known and not override.is_sweep_override() and str(override.value()) not in known:
-            raise UserError(f"unknown {key} '{override.value()}'; choose one of: {', '.join(known)}")
+        for value in _values(override) if known else ():
+            if known and value not in known:
+                raise UserError(unknown(key, value, known))
     overrides = [str(override.input_line) for override in parsed]
     if not any(override.key_or_group == "hardware" for override in parsed):
         overrides = [f"hardware={'cpu' if jax.default_backend() == 'cpu' else 'gpu'}", *overrides]
@@ -86,6 +92,25 @@ def _with_named_task(overrides: list[str]) -> list[str]:
         if override.partition("=")[0] == "env":
             raise UserError(f"give {override} or {KEY}={source}, not both")
     return [f"env={name}", *rest, f"{KEY}={source}"]
+
+
+def _values(override: Override) -> list[str]:
+    """The values of an override as text: several for `a,b`, and none for another kind of sweep."""
+    if override.is_choice_sweep():
+        return [value.strip("'\"") for value in override.sweep_string_iterator()]
+    return [] if override.is_sweep_override() else [str(override.value())]
+
+
+def _with_whole_numbers(overrides: list[str]) -> list[str]:
+    """Overrides in which integers are written as such: `total_steps=1e5` becomes `total_steps=100000`."""
+    types = setting_types(*chosen(overrides))
+    whole = []
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if equals and plain_type(types.get(key)) is int:
+            override = f"{key}={','.join(map(with_whole_number, value.split(',')))}"
+        whole.append(override)
+    return whole
 
 
 def _with_recipe(overrides: list[str]) -> list[str]:
@@ -160,8 +185,17 @@ def _parse(override: str) -> Override:
     try:
         return OverridesParser.create().parse_override(override)
     except HydraException as error:
-        reason = next((line for line in str(error).splitlines() if line.strip()), "it is malformed")
-        raise UserError(f"cannot read the command line: '{override}': {reason}") from error
+        raise UserError(f"cannot read '{override}'; write {_readable(override)}") from error
+
+
+def _readable(override: str) -> str:
+    """A correction of a malformed override: no spaces, one `=`, closed brackets. Without one, the general form."""
+    key, equals, value = override.partition("=")
+    value = re.sub(r"\s", "", value).strip("=,;")
+    value = re.sub(r"^\((.*)\)$", r"[\1]", value)
+    value += "]" * (value.count("[") - value.count("]"))
+    corrected = f"{key.strip()}={value}"
+    return corrected if equals and value and _is_readable(corrected) else "KEY=VALUE"
 
 
 def _text_keys(overrides: list[str]) -> set[str]:

@@ -86,8 +86,14 @@ class SavedPolicy:
 
         Args:
             obs: `[…, observation_size]`, any float dtype.
+
+        Raises:
+            UserError: the observation has another size.
         """
-        return np.asarray(self.act(np.asarray(obs, np.float32)))
+        obs, size = np.asarray(obs, np.float32), self.task.observation_size
+        if obs.shape[-1:] != (size,):
+            raise UserError(f"the observation has the shape {obs.shape}; this policy takes […, {size}]")
+        return np.asarray(self.act(obs))
 
 
 def make_task(config: Config) -> Task:

@@ -109,8 +109,8 @@ def _check(folder: RunFolder, config: Config) -> None:
     differing = [text for text in differing if not text.startswith(tuple(moved))]
     if differing:
         raise UserError(
-            f"resume=true with another configuration than {folder.config}: {in_short(differing)}; "
-            "with run_dir and resume=true alone it continues with the saved settings"
+            f"{folder.path} was trained with other settings: {in_short(differing)}; "
+            "give only run_dir and resume=true to continue with the saved ones, or choose another run_dir"
         )
     if folder.gymnasium_scores.exists() and not list_steps(folder.checkpoints):
         raise UserError(f"no checkpoint in {folder.checkpoints}, although the run was scored; choose another run_dir")

@@ -91,7 +91,7 @@ def open_existing(path: str | Path | None) -> RunFolder:
         raise UserError("say which run: run=RUN_DIR")
     folder = RunFolder(user_path(path))
     if not folder.is_run:
-        raise UserError(f"no run at '{path}': give the folder that holds its config.yaml")
+        raise UserError(f"no run at '{path}': {_where_a_run_is(folder.path)}")
     _refuse_special_files(folder.path)
     for path in (folder.config, folder.metrics, folder.gymnasium_scores):
         if path.is_dir():
@@ -100,6 +100,17 @@ def open_existing(path: str | Path | None) -> RunFolder:
         if path.is_file():
             raise UserError(f"'{path}' is a file, where a run has a folder; remove it")
     return folder
+
+
+def _where_a_run_is(path: Path) -> str:
+    """What to give instead of a path that is no run folder."""
+    above = next((parent for parent in path.parents if RunFolder(parent).config.is_file()), None)
+    if above:
+        return f"give the run's folder, {above}"
+    below = sorted(config.parent for config in path.glob("*/config.yaml")) if path.is_dir() else []
+    if below:
+        return f"give one of the runs in it, such as {below[-1]}"
+    return "give the folder that holds its config.yaml"
 
 
 def _refuse_special_files(folder: Path) -> None:

@@ -13,6 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.runs.config import Config, flatten, to_config
+from mjx_walk.runs.mistakes import first_line
 from mjx_walk.runs.own_tasks import find_saved_task
 from mjx_walk.runs.renamed import under_present_names
 from mjx_walk.runs.run_folder import RunFolder
@@ -118,7 +119,7 @@ def _read(path: Path) -> DictConfig:
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     except _UNREADABLE as error:
-        raise UserError(f"{path} is not a configuration of this version: {_first_line(error)}") from error
+        raise UserError(_unreadable(path, error)) from error
 
 
 def _parse(saved: DictConfig, path: Path) -> Config:
@@ -131,7 +132,7 @@ def _parse(saved: DictConfig, path: Path) -> Config:
     except UserError:
         raise
     except _UNREADABLE as error:
-        raise UserError(f"{path} is not a configuration of this version: {_first_line(error)}") from error
+        raise UserError(_unreadable(path, error)) from error
 
 
 _HOW_TO_REGISTER = "call mjx_walk.register_algorithm before load_run, or in the FILE.py of env.task=FILE.py:CLASS"
@@ -141,8 +142,17 @@ _UNREADABLE = (
 )
 
 
-def _first_line(error: BaseException) -> str:
-    return next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+def _unreadable(path: Path, error: BaseException) -> str:
+    """The error for a file that is not a saved configuration, with the line or the setting that is wrong."""
+    reason = first_line(error)
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem and error.problem_mark:
+        reason = f"line {error.problem_mark.line + 1}: {error.problem}"
+    elif isinstance(error, UnicodeDecodeError):
+        reason = "it is not a text in UTF-8"
+    elif getattr(error, "full_key", None):
+        full_key = error.full_key  # type: ignore[attr-defined]
+        reason = reason if "key" in reason.lower() else f"{full_key}: {reason}"
+    return f"{path} is not a configuration of this version: {reason}; correct it, or restore the file from a backup"
 
 
 def differences(saved: Config, config: Config, besides: tuple[str, ...] = MAY_DIFFER) -> list[str]:

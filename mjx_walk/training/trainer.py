@@ -128,10 +128,12 @@ class Trainer:
                 self._write(state, rows, progress)
                 diverged = not self._program.is_finite(state).all()
                 if call % self.config.checkpoint.every_calls == 0:
+                    progress.show_stage("saving")
                     self._save(state, call)
                     saved_call = call
             signal_name = self._stop_signal(interrupt)
             if saved_call != call:
+                progress.show_stage("saving")
                 self._save(state, call)
         progress.close()
         self._end(state, call, is_stopped=bool(signal_name or diverged))

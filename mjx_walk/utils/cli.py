@@ -6,12 +6,13 @@ Invalid input prints a one-line error and exits with code 2.
 import dataclasses
 import difflib
 import errno
+import functools
 import itertools
 import re
 import sys
 import tempfile
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -24,9 +25,11 @@ from mjx_walk.utils.compat import exempt_imports_from_gc, prepare_jax, standard_
 from mjx_walk.utils.console import console
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import check_replaceable
+from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.settings import validate
 from mjx_walk.utils.signals import Stopped, exit_code
 from mjx_walk.utils.subprocesses import end_with_parent
+from mjx_walk.utils.value_types import plain_type, type_mistake, with_whole_number
 from mjx_walk.utils.versions import __version__
 
 __all__ = [
@@ -42,6 +45,8 @@ __all__ = [
 
 Arguments = TypeVar("Arguments")
 _HELP = ("-h", "--help")
+_MOST_LISTED = 12
+"""Most keys that a message lists."""
 
 
 def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Arguments:
@@ -58,9 +63,9 @@ def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Argument
     if any(argument in _HELP for argument in arguments):
         print(usage.strip())
         raise SystemExit(0)
-    known = [field.name for field in dataclasses.fields(schema)]  # type: ignore[arg-type]
-    refuse_flags(arguments, lambda value: "run" if "run" in known and value not in known else None)
     node, hints = OmegaConf.structured(schema), typing.get_type_hints(schema)
+    known = list(hints)
+    refuse_flags(arguments, functools.partial(_key_of_value, schema), hints)
     texts: dict[str, str] = {}
     for argument in arguments:
         key, _, value = argument.partition("=")
@@ -69,10 +74,12 @@ def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Argument
         if hints[key] in (str, str | None):  # a folder may be called 007 or ${x}
             texts[key] = value
             continue
+        text = with_whole_number(value) if plain_type(hints[key]) is int else value
         try:
-            OmegaConf.update(node, key, OmegaConf.from_dotlist([f"value={value}"]).value)
+            OmegaConf.update(node, key, OmegaConf.from_dotlist([f"value={text}"]).value)
         except (OmegaConfBaseException, yaml.YAMLError) as error:
-            raise UserError(f"{argument}: {str(error).splitlines()[0]}") from error
+            mistake = type_mistake(key, value, hints[key])
+            raise UserError(mistake or f"{argument}: {str(error).splitlines()[0]}") from error
     parsed: Any = dataclasses.replace(OmegaConf.to_object(node), **texts)  # type: ignore[type-var]
     validate(parsed)
     return parsed
@@ -100,7 +107,8 @@ def parse_own(
     own_keys, other_keys = ([field.name for field in dataclasses.fields(kind)] for kind in (schema, others))  # type: ignore[arg-type]
     own: list[str] = []
     rest: list[str] = []
-    refuse_flags([argument for argument in arguments if argument not in _HELP], key_of)
+    hints = typing.get_type_hints(others) | typing.get_type_hints(schema)
+    refuse_flags([argument for argument in arguments if argument not in _HELP], key_of, hints)
     for argument in arguments:
         key = argument.partition("=")[0]
         is_own = key in (*own_keys, *_HELP)
@@ -112,29 +120,55 @@ def parse_own(
     return parse(schema, own, usage), rest
 
 
-def refuse_flags(arguments: list[str], key_of: Callable[[str], str | None] = lambda value: None) -> None:
+def refuse_flags(
+    arguments: list[str],
+    key_of: Callable[[str], str | None] = lambda value: None,
+    hints: Mapping[str, Any] | None = None,
+) -> None:
     """Check that every argument is `key=value`, and say how to write one that is not: `--num_envs 5`, `env humanoid`.
 
     Args:
         arguments: a part of the command line.
         key_of: maps a value that is given alone to the key that is meant, if it can be guessed.
+        hints: annotations of the keys. Another key is corrected only if it resembles one of them.
 
     Raises:
-        UserError: an argument without `=`, or one that begins with a dash.
+        UserError: an argument without `=` or without a key, or one that begins with a dash.
     """
     for argument, following in itertools.zip_longest(arguments, arguments[1:], fillvalue=""):
         key, equals, value = argument.partition("=")
-        if (equals and not key.startswith("-")) or not argument or argument[0] in "+~":  # Hydra's, refused elsewhere
+        if (equals and key and not key.startswith("-")) or argument[:1] in ("+", "~"):  # Hydra's, refused elsewhere
             continue
-        name = key.lstrip("-").replace("-", "_")
+        if not argument:
+            raise UserError("an argument is empty; write KEY=VALUE")
+        is_alone = equals or not following or ("=" in following[1:] or following.startswith("-"))
+        given = argument if is_alone else f"{argument} {following}"
         if not argument.startswith("-") and key_of(argument):
             wanted, given = f"{key_of(argument)}={argument}", argument
-        elif equals or not following or "=" in following or following.startswith("-"):
-            wanted, given = f"{name}={value or 'VALUE'}", argument
         else:
-            wanted, given = f"{name}={following}", f"{argument} {following}"
-        is_key = re.fullmatch(r"[\w.]+=.*", wanted, re.DOTALL)
+            wanted = _as_override(key, value if is_alone else following.removeprefix("="), hints)
+        is_key = re.fullmatch(r"[\w./]+=.*", wanted, re.DOTALL)
         raise UserError(f"cannot read '{given}'; write {wanted if is_key else 'KEY=VALUE'}")
+
+
+def _as_override(key: str, value: str, hints: Mapping[str, Any] | None) -> str:
+    """`num_envs=5` for `--num-envs` and `5`, or the general form if no such key is known."""
+    name, colon, after = key.lstrip("-").replace("-", "_").partition(":")
+    if hints is not None and name not in hints and "." not in name:
+        near = near_misses(name, hints, 1)
+        if not near:
+            return f"KEY=VALUE, where KEY is one of: {', '.join(hints)}" if len(hints) <= _MOST_LISTED else "KEY=VALUE"
+        name = near[0]
+    default = "true" if hints is not None and hints.get(name) is bool else "VALUE"
+    return f"{name}={value or (after if colon else '') or default}"
+
+
+def _key_of_value(schema: Any, value: str) -> str | None:
+    """The key whose choices a value is one of, or `run`, for a value that is given alone."""
+    fields = {field.name: field.metadata.get("choices", ()) for field in dataclasses.fields(schema)}
+    fitting = [name for name, choices in fields.items() if value in choices]
+    is_run = "run" in fields and value not in fields and not value.startswith("-")
+    return fitting[0] if fitting else "run" if is_run else None
 
 
 def read_seeds(value: Any) -> list[int]:
@@ -147,7 +181,9 @@ def read_seeds(value: Any) -> list[int]:
     are_seeds = isinstance(seeds, list) and all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds)
     if are_seeds and seeds and len(set(seeds)) == len(seeds):
         return seeds
-    raise UserError(f"seeds={value}: give a number of seeds, or a list of different seeds from 0 up")
+    raise UserError(
+        f"seeds={value}: give a number of seeds, or a list of different seeds from 0 up: seeds=3 or seeds=[3,7]"
+    )
 
 
 def check_writable(path: Path) -> None:
@@ -157,6 +193,9 @@ def check_writable(path: Path) -> None:
         UserError: the file or its folder cannot be written.
     """
     try:
+        for folder in path.parents:
+            if folder.exists() and not folder.is_dir():
+                raise UserError(f"cannot write {path}: {folder} is a file; choose another path")
         path.parent.mkdir(parents=True, exist_ok=True)
         check_replaceable(path)
         with tempfile.TemporaryFile(dir=path.parent):

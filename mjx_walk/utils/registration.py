@@ -25,10 +25,11 @@ def check_class(what: str, name: str, kind: Any, base: type, module: str, known:
         UserError: an invalid name, a class of another kind, one with abstract methods, or a name that is taken.
     """
     noun = what.rpartition(" ")[2]
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UserError(f"{what} cannot be called '{name}'; use lower-case letters, digits and underscores")
     if not (isinstance(kind, type) and issubclass(kind, base)):
-        raise UserError(f"the {noun} '{name}' is {kind!r}; give a subclass of {module}.{base.__name__}")
+        found = f"the {type(kind).__name__} {kind.__name__}" if hasattr(kind, "__name__") else repr(kind)
+        raise UserError(f"the {noun} '{name}' is {found}; give a subclass of {module}.{base.__name__}")
     missing = sorted(getattr(kind, "__abstractmethods__", ()))
     if missing:
         raise UserError(f"the class {kind.__name__} of the {noun} '{name}' does not define: {', '.join(missing)}")

@@ -5,10 +5,12 @@ import dataclasses
 import inspect
 import math
 import textwrap
+import typing
 from collections.abc import Iterable
 from typing import Any, NamedTuple, TypeVar
 
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.value_types import type_problem
 
 __all__ = [
     "AnyBut",
@@ -74,16 +76,20 @@ def with_name(schema: type[Schema], name: str) -> type[Schema]:
 
 
 def validate(config: Any, prefix: str = "") -> None:
-    """Check the ranges of all settings of a dataclass and of the dataclasses in it.
+    """Check the types and ranges of all settings of a dataclass and of the dataclasses in it.
 
     Raises:
-        UserError: the first value out of range, with its full key. NaN is never in range.
+        UserError: the first value of another type or out of range, with its full key. NaN is never in range.
     """
+    hints = typing.get_type_hints(type(config))
     for field in dataclasses.fields(config):
         value, key = getattr(config, field.name), prefix + field.name
         if dataclasses.is_dataclass(value):
             validate(value, key + ".")
             continue
+        mistake = type_problem(value, hints[field.name])
+        if mistake:
+            raise UserError(f"{key}={value!r}: {mistake}")
         for item in value if isinstance(value, list | tuple) else (value,):
             problem = _problem(item, field.metadata)
             if problem:

@@ -10,6 +10,8 @@ from pathlib import Path
 from mjx_walk.runs.run_folder import RunFolder, open_existing
 from mjx_walk.runs.scores import BEST, read_scores
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.files import user_path
+from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.text import format_score
 
 PREFIX = "zoo:"
@@ -28,13 +30,21 @@ def open_run(run: str | Path | None) -> RunFolder:
     Raises:
         UserError: no run is given, or there is none of that path or name.
     """
-    if run is None:
-        raise UserError(f"say which run: run=RUN_DIR or run={PREFIX}NAME; python -m mjx_walk.zoo lists the names")
+    if run is None or not str(run):
+        raise UserError(f"say which run: run=RUN_DIR, or run={PREFIX}NAME; python -m mjx_walk.zoo lists the names")
     if not str(run).startswith(PREFIX):
+        if str(run) in names() and not user_path(run).exists():
+            raise UserError(f"no run at '{run}'; did you mean: {PREFIX}{run}?")
         return open_existing(run)
     name = str(run).removeprefix(PREFIX)
     if name not in names():
-        raise UserError(f"no policy '{name}' in the zoo; choose one of: {', '.join(names())}")
+        near = near_misses(name, names()) or [known for known in names() if name and known.startswith(f"{name}-")]
+        hint = (
+            f"did you mean: {', '.join(PREFIX + known for known in near)}?"
+            if near
+            else f"choose one of: {', '.join(names())}"
+        )
+        raise UserError(f"no policy '{name}' in the zoo; {hint}")
     return RunFolder(_FOLDER / name)
 
 

@@ -42,6 +42,8 @@ def main(command_line: list[str]) -> None:
     """List the policies, or add one."""
     arguments = cli.parse(Arguments, command_line, USAGE)
     if arguments.add is None:
+        if arguments.name is not None:
+            raise UserError(f"name={arguments.name} needs add=RUN_DIR, the run to add under this name")
         print(zoo.table())
         return
     if arguments.name is None:

@@ -149,7 +149,7 @@ def test_a_suite_has_every_environment_with_its_own_recipe(tmp_path):
     out, planned = suite.plan_suite("mujoco", [], ["ppo"], [3], str(tmp_path), "cpu")
     assert out == tmp_path and len({run.config.env.name for run in planned}) == 11 == len(planned)
     assert planned[1].name == "humanoid_standup/ppo/seed_3" and planned[1].folder.path == tmp_path / planned[1].name
-    with pytest.raises(UserError, match="suite=mujoco has its own environments; leave one of both out"):
+    with pytest.raises(UserError, match="suite=mujoco has its own environments; leave out one of the two"):
         suite.plan_suite("mujoco", ["env=ant"], ["ppo"], [0], None, "cpu")
 
 
@@ -218,18 +218,18 @@ BAD = [
     (["algos=[]"], "algos=[]: choose some of: ppo"),
     (["seeds=0"], "seeds=0: give a number of seeds, or a list of different seeds from 0 up"),
     (["seeds=[a]"], "give a number of seeds"),
-    (["algo=ppo"], "'algo=ppo': in a comparison write algos=[…]"),
-    (["seed=1"], "write seeds=N"),
+    (["algo=ppo"], "'algo=ppo': in a comparison write 'algos=[ppo]'"),
+    (["seed=1"], "'seed=1': in a comparison write seeds=[1]"),
     (["devices=99"], "devices=99: this machine has"),
     (["per_device=0"], "per_device=0: must be at least 1"),
     (["env=snake"], "unknown env 'snake'"),
     (["algo.discount=0.9,2.0"], "algo.discount=2.0: must be at most 1"),
     (["draw=true", "out=nowhere"], "no runs below 'nowhere'"),
     (["suite=atari"], "suite=atari: choose one of: mujoco"),
-    (["suite=mujoco", "env=ant"], "'env=ant': suite=mujoco has its own environments; leave one of both out"),
+    (["suite=mujoco", "env=ant"], "'env=ant': suite=mujoco has its own environments; leave out one of the two"),
     (["draw=true"], "say which runs to draw: out=DIR"),
-    (["env=walker2d,humanoid"], "one comparison is of one environment, not of humanoid v5, walker2d v5"),
-    (["env.version=v4,v5"], "one comparison is of one environment"),
+    (["env=walker2d,humanoid"], "a comparison has one environment; give one of them, or suite=mujoco for all"),
+    (["env.version=v4,v5"], "a comparison has one environment; these are several: humanoid v4, humanoid v5"),
     (["algo.discount=interval(0.9,0.99)"], "list the values, algo.discount=A,B"),
     (["algos=[ppo"], "algos=[ppo: "),
 ]
@@ -304,10 +304,26 @@ def test_a_second_comparison_in_the_same_folder_waits_its_turn(tmp_path):
     assert planned_runs.run_jobs([], [None], tmp_path / "out" / "logs", lambda run, log: None) is None
 
 
+@pytest.mark.parametrize(
+    ("log", "reason"),
+    [
+        ("Training …\nerror: no space\n", ": no space"),
+        ("Traceback (most recent call last):\n  …\njaxlib.XlaRuntimeError: no\n", ": jaxlib.XlaRuntimeError: no"),
+        ("XlaRuntimeError: RESOURCE_EXHAUSTED: 5 GB\n", ": memory ran out, so try together=1 or a smaller num_envs"),
+        ("Training …\n", ""),
+    ],
+)
+def test_the_reason_of_a_failure_is_the_last_line_of_its_log(tmp_path, log, reason):
+    (tmp_path / "log.txt").write_text(log)
+    assert compare_command._reason(tmp_path / "log.txt") == reason
+
+
 def test_a_run_that_fails_is_named(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     assert command_here("compare", "algos=[ppo]", "seeds=1", "out=out", *SMALL, "num_envs=7") == 2
-    assert "not finished: ppo/seed_0" in capfd.readouterr().err
+    printed = capfd.readouterr()
+    assert "not finished: ppo/seed_0" in printed.err
+    assert "ppo/seed_0: not finished: num_envs=7 times algo.num_unrolls=1 must be a multiple of" in printed.out
     assert "choose num_envs a multiple of" in (tmp_path / "out" / "logs" / "ppo" / "seed_0.txt").read_text()
 
 

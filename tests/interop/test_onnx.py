@@ -100,7 +100,7 @@ def test_example_of_readme(tmp_path, capsys):
 def test_export_prints_a_one_line_error(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     for arguments, message in (
-        ((), "say which run: run=RUN_DIR or run=zoo:NAME"),
+        ((), "say which run: run=RUN_DIR, or run=zoo:NAME; python -m mjx_walk.zoo lists the names"),
         (("run=zoo:walker2d-sac", "format=tflite"), "format=tflite"),
         (("run=zoo:walker2d-sac", f"out={tmp_path}/file/policy.onnx"), "cannot write"),
     ):

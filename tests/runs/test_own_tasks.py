@@ -124,7 +124,7 @@ def test_a_class_from_python(home, capsys):
         (["env.task=t.py:Slow"], "has no class 'Slow'"),
         (["env.task=my_helper.py:FACTOR"], "has no class 'FACTOR'"),
         (["env.task=t.py:pathlib"], "has no class 'pathlib'"),
-        (["env.task=t.py"], "write PATH.py:CLASS"),
+        (["env.task=t.py"], "it names no class; write t.py:CLASS; it defines: FastWalker"),
         (["env.task=t.py:FastWalker", "env.speed=1"], "unknown key 'env.speed'"),
     ],
 )

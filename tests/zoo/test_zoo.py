@@ -64,7 +64,7 @@ def test_the_table_and_an_unknown_name(capsys):
         assert "use only letters, digits, '_' and '-'" in capsys.readouterr().err
     assert zoo.names() == NAMES
     assert command_here("eval", "run=zoo:humanoid-dqn") == 2
-    assert "no policy 'humanoid-dqn' in the zoo; choose one of: " in capsys.readouterr().err
+    assert "no policy 'humanoid-dqn' in the zoo; did you mean: zoo:humanoid-" in capsys.readouterr().err
 
 
 def test_a_policy_can_be_copied_and_pickled():
