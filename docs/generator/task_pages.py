@@ -20,6 +20,7 @@ def page(name: str) -> str:
     parts = [
         f"# {task.GYMNASIUM_NAME}",
         f"{text.goal} It is Gymnasium's `{task.gymnasium_id}`. Numbers and tables are those of v5.",
+        f"![{text.goal.removesuffix('.')}]({name}.webp)",
         f"```\npython -m mjx_walk.train env={name}\n```",
         _shipped_policies(name),
         _overview(tasks),
