@@ -6,9 +6,10 @@ a test fails if a committed page differs.
 
 from pathlib import Path
 
-from generator import setting_tables, task_pages
+from generator import score_tables, setting_tables, task_pages
 from generator.markdown import with_block
 
+from mjx_walk import zoo
 from mjx_walk.algos import BUILT_IN_ALGORITHMS
 from mjx_walk.envs import BUILT_IN_TASKS
 
@@ -20,9 +21,12 @@ def pages() -> dict[Path, str]:
     found = {DOCS / "tasks" / f"{name}.md": task_pages.page(name) for name in BUILT_IN_TASKS}
     found[DOCS / "tasks" / "index.md"] = _filled("tasks/index.md", {"tasks": task_pages.overview_of_all()})
     groups = {name: setting_tables.group_table(name) for name in setting_tables.GROUPS}
+    found[DOCS.parent / "README.md"] = _filled("../README.md", {"best": score_tables.best()})
+    scores = {"recipes": score_tables.recipes(), "suite": score_tables.suite(), "zoo": zoo.table()}
+    found[DOCS / "results.md"] = _filled("results.md", scores)
     found[DOCS / "configuration.md"] = _filled("configuration.md", groups)
     for name in BUILT_IN_ALGORITHMS:
-        blocks = {"settings": setting_tables.algorithm_table(name), "scores": setting_tables.score_table(name)}
+        blocks = {"settings": setting_tables.algorithm_table(name), "scores": score_tables.of_algorithm(name)}
         found[DOCS / "algorithms" / f"{name}.md"] = _filled(f"algorithms/{name}.md", blocks)
     return found
 

@@ -1,6 +1,6 @@
 """The tables of scores in README.md and docs/results.md."""
 
-import importlib.util
+import importlib
 import re
 
 import numpy as np
@@ -10,19 +10,20 @@ from helpers import CLONE
 
 from mjx_walk.experiments.suite import REFERENCES, normalize
 
-_SPEC = importlib.util.spec_from_file_location("result_tables", CLONE / "docs" / "result_tables.py")
-tables = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(tables)
+DOCS = CLONE / "docs"
 
 
-@pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
-def test_pages_hold_the_present_tables(page):
-    text = page.read_text()
-    assert "<!-- begin " in text and tables.fill(text) == text, "run: python docs/result_tables.py"
+@pytest.fixture(autouse=True)
+def _generator_on_path(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS))
+
+
+def read(name):
+    return importlib.import_module("generator.score_tables").read(name)
 
 
 def test_readme_shows_the_best_algorithm_of_each_task():
-    rows = tables._read("results.csv")
+    rows = read("results.csv")
     shown = [row for row in rows if row["published_v5"]]
     assert len(shown) == 3
     for row in shown:
@@ -30,8 +31,8 @@ def test_readme_shows_the_best_algorithm_of_each_task():
 
 
 def test_normalized_scores_follow_from_the_table():
-    text = (CLONE / "docs" / "results.md").read_text()
-    scores = {row["id"]: row for row in tables._read("experiments.csv") if row["id"].startswith("MS")}
+    text = (DOCS / "results.md").read_text()
+    scores = {row["id"]: row for row in read("experiments.csv") if row["id"].startswith("MS")}
     found = []
     for suffix in ("", "@best"):
         rows = [scores[f"MS{number}{suffix}"] for number in range(1, 12)]
@@ -43,10 +44,8 @@ def test_normalized_scores_follow_from_the_table():
 
 
 def test_the_scaling_figure_shows_the_factors_of_the_table():
-    spec = importlib.util.spec_from_file_location("scaling_figure", CLONE / "docs" / "scaling_figure.py")
-    figure = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(figure)
+    figure = importlib.import_module("scaling_figure")
     found = [f"{factor:.2f}" for values in figure.factors().values() for factor in values[1:]]
-    text = (CLONE / "docs" / "results.md").read_text()
+    text = (DOCS / "results.md").read_text()
     shown = re.findall(r"^\| (?:PPO|csac) \| [24] \| [\d,]+ \| [\d,]+ \| ([\d.]+) \| [24] \|", text, flags=re.MULTILINE)
     assert found == shown and len(shown) == 8

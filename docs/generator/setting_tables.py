@@ -1,8 +1,5 @@
 """Tables of settings, from the dataclasses that declare them."""
 
-import re
-from pathlib import Path
-
 from generator.markdown import code, table
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
@@ -20,8 +17,6 @@ GROUPS = {
     "shaping": (Shaping, "env.shaping."),
 }
 """Groups of settings that do not depend on the task or the algorithm, with the start of their full keys."""
-
-_RESULTS = Path(__file__).parent.parent / "results.md"
 
 
 def settings_table(schema: type, prefix: str) -> str:
@@ -55,22 +50,6 @@ def group_table(name: str) -> str:
 def algorithm_table(name: str) -> str:
     """The settings of an algorithm."""
     return settings_table(ALGORITHMS[name][1], "algo.")
-
-
-def score_table(name: str) -> str:
-    """The rows of an algorithm in the table of scores in results.md, with the cells that a reader compares.
-
-    Raises:
-        ValueError: the table has other columns than expected.
-    """
-    text = _RESULTS.read_text().partition("## Scores of all recipes")[2].partition("\n## ")[0]
-    lines = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| ")]
-    titles, rows = lines[0], lines[2:]
-    wanted = ("Task", "Algorithm", "Score", "Std", "Seeds", "Steps (M)", "Command")
-    columns = [titles.index(title) for title in wanted]
-    own = [row for row in rows if re.match(rf"{name}\b", row[titles.index("Algorithm")], flags=re.IGNORECASE)]
-    aligned = [f">{title}" if title in ("Score", "Std", "Seeds", "Steps (M)") else title for title in wanted]
-    return table(aligned, [[row[column] for column in columns] for row in own])
 
 
 def all_schemas() -> list[type]:
