@@ -16,8 +16,9 @@ from mjx_walk.experiments.report import LEGEND, csv_row, draw_curves, run_cells,
 from mjx_walk.runs.metrics import write_csv
 from mjx_walk.runs.scores import BEST, FINAL
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import replacing, user_path, write_text
+from mjx_walk.utils.files import refuse_links, replacing, user_path, write_text
 from mjx_walk.utils.text import format_score
+from mjx_walk.viewing.figures import standard_style
 
 SUITES = {"mujoco": tuple(BUILT_IN_TASKS)}
 """Environments of each suite."""
@@ -57,11 +58,13 @@ def plan_suite(
     folder = user_path(out or f"runs/compare_{suite}")
     runs = []
     for env in SUITES[suite]:
+        refuse_links(folder / env, folder)
         _, planned = planned_runs.plan([f"env={env}", *overrides], algos, seeds, str(folder / env), hardware)
         runs += [PlannedRun(f"{env}/{run.variant}", run.overrides, run.config) for run in planned]
     return folder, runs
 
 
+@standard_style()
 def write_report(folder: Path) -> Path:
     """Write `comparison.png`, `comparison.md` and `comparison.csv` about all runs below a folder.
 

@@ -20,7 +20,7 @@ import numpy as np
 import tensorstore
 
 from mjx_walk.utils.errors import UserError, failed_read
-from mjx_walk.utils.files import write_text
+from mjx_walk.utils.files import open_to_read, write_text
 
 __all__ = ["HostArrays", "read_arrays", "write_arrays"]
 
@@ -28,6 +28,11 @@ _NUMPY = "arrays.npz"
 """File that replaces Orbax's files for small pytrees, and in folders of earlier versions for other processes."""
 _METADATA = "_METADATA"
 """Orbax's file about the arrays in a folder."""
+
+_MAX_OVERHEAD = 10_000_000
+"""Bytes of an archive beyond twice those of its arrays. Python keeps each entry of its directory in memory."""
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""What NumPy writes. Python would unpack other kinds without a limit of their memory."""
 
 HostArrays = dict[str, np.ndarray]
 """Host copies of a pytree's leaves, by path."""
@@ -152,24 +157,38 @@ def read_arrays(path: Path, expected: Mapping[str, Any], present_name: Callable[
 
 
 def _read_numpy(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:
-    arrays = {}
-    with zipfile.ZipFile(path / _NUMPY) as archive:
-        for member in archive.infolist():
-            name = present_name(member.filename.removesuffix(".npy"))
-            if name not in expected:
-                continue
-            with archive.open(member) as file:
-                if np.lib.format.read_magic(file) != (1, 0):
-                    raise ValueError(f"{name} has another version of NumPy's format")
-                shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-                _check(path, name, expected[name], shape, dtype)
-                if member.file_size != file.tell() + math.prod(shape) * dtype.itemsize:
-                    raise ValueError(f"{name} has another size than its header says")
-            with archive.open(member) as file:
-                arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
-            if dtype.kind == "V":  # NumPy's files do not support bfloat16
-                arrays[name] = arrays[name].view(expected[name].dtype)
+    arrays: HostArrays = {}
+    with open_to_read(path / _NUMPY) as content:
+        most = 2 * sum(math.prod(array.shape) * array.dtype.itemsize for array in expected.values()) + _MAX_OVERHEAD
+        if os.fstat(content.fileno()).st_size > most:
+            raise ValueError(f"{_NUMPY} is larger than {most:,} bytes, twice what its arrays have")
+        with zipfile.ZipFile(content) as archive:
+            for member in archive.infolist():
+                name = present_name(member.filename.removesuffix(".npy"))
+                if name in arrays:  # ten thousand entries may share the bytes of one
+                    raise ValueError(f"{name} is there twice")
+                if name in expected:
+                    arrays[name] = _read_member(path, archive, member, name, expected[name])
     return arrays
+
+
+def _read_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, expected: Any) -> np.ndarray:
+    """Read an array of a NumPy archive, after a look at its header."""
+    if member.compress_type not in _COMPRESSIONS:
+        raise ValueError(f"{name} is compressed in another way than NumPy does")
+    with archive.open(member) as file:
+        if np.lib.format.read_magic(file) != (1, 0):
+            raise ValueError(f"{name} has another version of NumPy's format")
+        try:
+            shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+        except MemoryError as error:  # so Python's parser reports deep nesting
+            raise ValueError(f"the header of {name} cannot be read") from error
+        _check(path, name, expected, shape, dtype)
+        if member.file_size != file.tell() + math.prod(shape) * dtype.itemsize:
+            raise ValueError(f"{name} has another size than its header says")
+    with archive.open(member) as file:
+        array = np.lib.format.read_array(file, allow_pickle=False)
+    return array.view(expected.dtype) if dtype.kind == "V" else array  # NumPy's files do not support bfloat16
 
 
 def _read_orbax(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:

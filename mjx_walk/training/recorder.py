@@ -195,7 +195,7 @@ class Recorder:
             scored[name] = (scores, facts["env_steps"])
             blocks[name] = scores.block(**facts)
         with self._writing():
-            write_scores(self._folder.gymnasium_scores, self._task.gymnasium_id, blocks, wall_seconds=wall_seconds)
+            write_scores(self._folder.gymnasium_scores, self._task.gymnasium_id, blocks, {"wall_seconds": wall_seconds})
         return scored
 
     def wait(self) -> None:

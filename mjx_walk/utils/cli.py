@@ -26,6 +26,7 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import check_replaceable
 from mjx_walk.utils.settings import validate
 from mjx_walk.utils.signals import Stopped, exit_code
+from mjx_walk.utils.text import printable
 from mjx_walk.utils.versions import __version__
 
 __all__ = [
@@ -211,7 +212,7 @@ def _exit_code_of(command: Callable[[list[str]], int | None]) -> int:
     except OSError as error:
         if error.errno not in _DISK_ERRORS:
             raise
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(str(error))}", file=sys.stderr)
         return 2
     except Stopped as stopped:
         print(f"Stopped by {stopped.signal_name}.", file=sys.stderr)

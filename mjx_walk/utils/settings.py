@@ -11,6 +11,8 @@ __all__ = ["AnyBut", "describe", "has_effect", "refuse_ineffective", "setting", 
 
 Schema = TypeVar("Schema")
 
+_MAX_ITEMS = 100
+"""Values that a list may have. Each layer of a network takes its time to compile."""
 _MAX_INT = 10**12
 """No count is larger. JAX cannot hold shapes from 2**63 elements on, and some of its errors end the process."""
 
@@ -70,7 +72,10 @@ def validate(config: Any, prefix: str = "") -> None:
         if dataclasses.is_dataclass(value):
             validate(value, key + ".")
             continue
-        for item in value if isinstance(value, list | tuple) else (value,):
+        items = value if isinstance(value, list | tuple) else (value,)
+        if len(items) > _MAX_ITEMS:
+            raise UserError(f"{key} has {len(items):,} values; give at most {_MAX_ITEMS}")
+        for item in items:
             problem = _problem(item, field.metadata)
             if problem:
                 raise UserError(f"{key}={value}: {problem}")

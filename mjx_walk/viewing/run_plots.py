@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from mjx_walk.runs.metrics import Row, read_rows, write_csv
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.utils.files import replacing
+from mjx_walk.viewing.figures import standard_style
 
 _X_AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))
 """Key of a row, unit and label of each horizontal axis."""
@@ -18,6 +19,7 @@ _QUANTITIES = (("return", "return"), ("length", "episode length"))
 _MAX_PLOTS = 32
 
 
+@standard_style()
 def plot_run(folder: RunFolder) -> list[Path]:
     """Draw the curves of a run into its folder.
 
@@ -89,7 +91,7 @@ def _grid(rows: list[Row], names: list[str], ylabel: str, path: Path) -> Path:
     for axes, name in zip(plots, names, strict=False):
         x, y = series(rows, "env_steps", name)
         axes.plot(x / 1e6, y)
-        axes.set_title(name.partition("/")[2], fontsize=9, parse_math=False)
+        axes.set_title(name.partition("/")[2], fontsize=9)
         axes.set_xlabel("million steps", fontsize=8)
         axes.set_ylabel(ylabel, fontsize=8)
         axes.grid(alpha=0.3)

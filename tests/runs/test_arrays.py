@@ -128,6 +128,32 @@ def test_a_member_that_is_not_what_it_says_is_damage(tmp_path, content):
     assert not isinstance(error.value, UserError) and "\n" not in str(error.value)
 
 
+def test_a_header_that_overwhelms_the_parser_is_damage(tmp_path):
+    header = b"{'descr': " + b"-" * 9000 + b"1}\n"
+    content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+    with pytest.raises(ValueError, match="is damaged: the header of a cannot be read"):
+        read_arrays(archive(tmp_path / "x", a=content), EXPECTED, same)
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_only_the_compression_of_numpy_is_read(tmp_path, compression):
+    (tmp_path / "x").mkdir()
+    with zipfile.ZipFile(tmp_path / "x" / "arrays.npz", "w", compression) as file:
+        file.writestr("a.npy", npy(EXPECTED["a"]))
+    with pytest.raises(ValueError, match="is damaged: a is compressed in another way"):
+        read_arrays(tmp_path / "x", EXPECTED, same)
+
+
+def test_an_archive_names_each_array_once_and_is_not_much_larger_than_its_arrays(tmp_path):
+    folder = archive(tmp_path / "x", a=npy(EXPECTED["a"]), former=npy(EXPECTED["a"]))
+    with pytest.raises(ValueError, match="is damaged: a is there twice"):
+        read_arrays(folder, EXPECTED, lambda name: "a")
+    with (folder / "arrays.npz").open("ab") as file:
+        file.write(bytes(11_000_000))
+    with pytest.raises(ValueError, match=r"is damaged: arrays\.npz is larger than"):
+        read_arrays(folder, EXPECTED, same)
+
+
 def test_a_pickle_in_an_archive_is_not_loaded(tmp_path, capsys):
     with pytest.raises(UserError, match=r"a should be \(2, 3\) float32, found \(2, 3\) object"):
         read_arrays(archive(tmp_path / "x", a=OBJECTS.getvalue()), EXPECTED, same)
