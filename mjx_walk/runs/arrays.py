@@ -29,8 +29,9 @@ _NUMPY = "arrays.npz"
 _METADATA = "_METADATA"
 """Orbax's file about the arrays in a folder."""
 
-_MAX_OVERHEAD = 10_000_000
-"""Bytes of an archive beyond twice those of its arrays. Python keeps each entry of its directory in memory."""
+_MAX_OVERHEAD, _MAX_OVERHEAD_OF_NUMPY = 100_000_000, 10_000_000
+"""Bytes of a folder beyond twice those of its arrays. TensorStore ends the process if its index exceeds the memory,
+and Python keeps each entry of an archive's directory there."""
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """What NumPy writes. Python would unpack other kinds without a limit of their memory."""
 
@@ -145,6 +146,7 @@ def read_arrays(path: Path, expected: Mapping[str, Any], present_name: Callable[
     """
     read = _read_numpy if (path / _NUMPY).exists() else _read_orbax
     try:
+        _check_size(path, expected, _MAX_OVERHEAD_OF_NUMPY if read is _read_numpy else _MAX_OVERHEAD)
         with _as_os_error(path):
             return read(path, expected, present_name)
     except (UserError, MemoryError):
@@ -158,17 +160,13 @@ def read_arrays(path: Path, expected: Mapping[str, Any], present_name: Callable[
 
 def _read_numpy(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:
     arrays: HostArrays = {}
-    with open_to_read(path / _NUMPY) as content:
-        most = 2 * sum(math.prod(array.shape) * array.dtype.itemsize for array in expected.values()) + _MAX_OVERHEAD
-        if os.fstat(content.fileno()).st_size > most:
-            raise ValueError(f"{_NUMPY} is larger than {most:,} bytes, twice what its arrays have")
-        with zipfile.ZipFile(content) as archive:
-            for member in archive.infolist():
-                name = present_name(member.filename.removesuffix(".npy"))
-                if name in arrays:  # ten thousand entries may share the bytes of one
-                    raise ValueError(f"{name} is there twice")
-                if name in expected:
-                    arrays[name] = _read_member(path, archive, member, name, expected[name])
+    with open_to_read(path / _NUMPY) as content, zipfile.ZipFile(content) as archive:
+        for member in archive.infolist():
+            name = present_name(member.filename.removesuffix(".npy"))
+            if name in arrays:  # ten thousand entries may share the bytes of one
+                raise ValueError(f"{name} is there twice")
+            if name in expected:
+                arrays[name] = _read_member(path, archive, member, name, expected[name])
     return arrays
 
 
@@ -212,6 +210,13 @@ def _read_orbax(path: Path, expected: Mapping[str, Any], present_name: Callable[
                 raise ValueError(f"{name} has larger pieces than its shape")
         reading = {name: store.read() for name, store in stores.items()}
         return {name: np.asarray(future.result()) for name, future in reading.items()}
+
+
+def _check_size(path: Path, expected: Mapping[str, Any], overhead: int) -> None:
+    """Check that the files of a folder are not much larger than the expected arrays."""
+    most = 2 * sum(math.prod(array.shape) * array.dtype.itemsize for array in expected.values()) + overhead
+    if sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) > most:
+        raise ValueError(f"it has more than {most:,} bytes, twice what its arrays have")
 
 
 def _check(path: Path, name: str, expected: Any, shape: tuple[int, ...], dtype: np.dtype) -> None:

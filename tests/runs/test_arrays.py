@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import pickle
 import subprocess
 import sys
@@ -150,8 +151,15 @@ def test_an_archive_names_each_array_once_and_is_not_much_larger_than_its_arrays
         read_arrays(folder, EXPECTED, lambda name: "a")
     with (folder / "arrays.npz").open("ab") as file:
         file.write(bytes(11_000_000))
-    with pytest.raises(ValueError, match=r"is damaged: arrays\.npz is larger than"):
+    with pytest.raises(ValueError, match="is damaged: it has more than"):
         read_arrays(folder, EXPECTED, same)
+
+
+def test_a_manifest_of_any_size_does_not_end_the_process(tmp_path):
+    write_arrays(tmp_path / "x", EXPECTED)
+    os.truncate(tmp_path / "x" / "manifest.ocdbt", 10**11)
+    with pytest.raises(ValueError, match="is damaged: it has more than"):
+        read_arrays(tmp_path / "x", EXPECTED, same)
 
 
 def test_a_pickle_in_an_archive_is_not_loaded(tmp_path, capsys):
