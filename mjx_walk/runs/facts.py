@@ -15,7 +15,7 @@ __all__ = ["FORMAT", "read_facts", "write_facts"]
 FORMAT = 1
 """Version of the checkpoint format. Increment it when a change makes older checkpoints unreadable."""
 
-_MAX_BYTES = 10_000_000
+_MAX_BYTES = 2_000_000
 _MAX_NUMBER = 1e300
 _REQUIRED = ("env_steps", "crc32")
 

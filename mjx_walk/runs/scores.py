@@ -23,8 +23,8 @@ BETTER = "better"
 """The better of both, chosen on the scored episodes themselves: what a file with one block holds."""
 
 _MAX_NUMBER = 1e300
-_MAX_BYTES = 20_000_000
-"""About 250,000 episodes of both policies."""
+_MAX_BYTES = 10_000_000
+"""About 125,000 episodes of both policies."""
 
 
 @dataclasses.dataclass

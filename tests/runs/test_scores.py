@@ -36,5 +36,5 @@ def test_scores_of_any_size_take_little_memory(tmp_path):
     path = tmp_path / "eval_gymnasium.json"
     with path.open("wb") as file:
         file.truncate(10**12)
-    with pytest.raises(ValueError, match="holds no scores: it is larger than 20,000,000 bytes"):
+    with pytest.raises(ValueError, match="holds no scores: it is larger than 10,000,000 bytes"):
         read_scores(path)
