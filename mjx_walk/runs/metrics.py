@@ -22,7 +22,10 @@ _MAX_NUMBER = 1e300
 _MAX_LINE = 10_000_000
 """Bytes of a row; a usual one has about a thousand."""
 _MAX_VALUES = 8_000_000
-"""Values of all rows, of which a usual one has about thirty. They take less than a gigabyte."""
+"""Values of all rows, of which a usual one has about thirty. They take half a gigabyte."""
+_VALUES_PER_ROW = 8
+"""Values that take as much memory as an empty row."""
+_MAX_LINES = 1_000_000
 _MAX_NAME = 10_000
 _FORMULA = ("=", "+", "-", "@")
 """What a spreadsheet takes for the start of a formula."""
@@ -108,8 +111,8 @@ def read_rows(path: Path) -> list[Row]:
             row = _as_row(line)
             if row is not None:
                 rows.append({names.setdefault(name, name): value for name, value in row.items()})
-                num_values += len(row)
-            if num_values > _MAX_VALUES or number > _MAX_VALUES:
+                num_values += len(row) + _VALUES_PER_ROW
+            if num_values > _MAX_VALUES or number > _MAX_LINES:
                 raise UserError(f"{path} has too many rows for the log of a run; remove it, or some of its lines")
     except FileNotFoundError:
         return []

@@ -133,7 +133,7 @@ def test_names_in_a_log_cannot_stop_the_plots(tmp_path, name):
     assert [path.stat().st_size > 100 for path in plot_run(RunFolder(tmp_path))] == [True] * 4
 
 
-@pytest.mark.parametrize("limit", ["_MAX_VALUES", "_MAX_LINE"])
+@pytest.mark.parametrize("limit", ["_MAX_VALUES", "_MAX_LINES", "_MAX_LINE"])
 def test_a_log_of_any_size_takes_little_memory(tmp_path, monkeypatch, limit):
     path = tmp_path / "metrics.jsonl"
     monkeypatch.setattr(metrics, limit, 100)
@@ -142,7 +142,7 @@ def test_a_log_of_any_size_takes_little_memory(tmp_path, monkeypatch, limit):
         with pytest.warns(UserWarning, match="line 2 and 10 more of"):
             assert [row["env_steps"] for row in read_rows(path)] == [1, 2]
     else:
-        path.write_text(line(1) * 100)
+        path.write_text(line(1) * 101)
         with pytest.raises(UserError, match=r"metrics\.jsonl has too many rows for the log of a run; remove it"):
             read_rows(path)
 
