@@ -13,7 +13,7 @@ from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
 from mjx_walk.envs.task import Task
-from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.task_options import MAX_FRAME_SKIP, TaskOptions
 from mjx_walk.envs.view import View
 from mjx_walk.utils.settings import setting
 
@@ -26,7 +26,7 @@ class InvertedPendulumOptions(TaskOptions):
     """Keyword arguments of Gymnasium's `InvertedPendulumEnv`. v4 takes none of them."""
 
     name: str = setting("inverted_pendulum", choices=("inverted_pendulum",))
-    frame_skip: int = setting(2, at_least=1)
+    frame_skip: int = setting(2, at_least=1, at_most=MAX_FRAME_SKIP)
     reset_noise_scale: float = setting(1e-2, at_least=0)
     """Bound of the uniform noise on positions and velocities of a reset."""
 

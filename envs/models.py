@@ -14,7 +14,7 @@ from jaxtyping import Int
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import user_path
 from mjx_walk.utils.near_misses import near_misses
-from mjx_walk.utils.quiet_mujoco import hide_deprecations
+from mjx_walk.utils.quiet_mujoco import hide_deprecations, write_no_log
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -51,6 +51,7 @@ def load_model(xml_file: str) -> mujoco.MjModel:
     Raises:
         UserError: the file does not exist, or MuJoCo cannot read it.
     """
+    write_no_log()
     path = model_path(xml_file)
     if not path.is_file():
         raise UserError(_not_found(str(xml_file), path))

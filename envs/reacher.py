@@ -13,7 +13,7 @@ from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
 from mjx_walk.envs.task import Task
-from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.task_options import MAX_FRAME_SKIP, TaskOptions
 from mjx_walk.envs.view import View
 from mjx_walk.utils.settings import setting
 
@@ -30,7 +30,7 @@ class ReacherOptions(TaskOptions):
     """Keyword arguments of Gymnasium's `ReacherEnv`. v4 takes none of them."""
 
     name: str = setting("reacher", choices=("reacher",))
-    frame_skip: int = setting(2, at_least=1)
+    frame_skip: int = setting(2, at_least=1, at_most=MAX_FRAME_SKIP)
     max_episode_steps: int = setting(50, at_least=1)
     reward_dist_weight: float = 1.0
     """Weight of the distance to the target."""

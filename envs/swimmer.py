@@ -13,7 +13,7 @@ from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
 from mjx_walk.envs.task import Task
-from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.task_options import MAX_FRAME_SKIP, TaskOptions
 from mjx_walk.envs.view import View
 from mjx_walk.utils.settings import setting
 
@@ -23,7 +23,7 @@ class SwimmerOptions(TaskOptions):
     """Keyword arguments of Gymnasium's `SwimmerEnv`."""
 
     name: str = setting("swimmer", choices=("swimmer",))
-    frame_skip: int = setting(4, at_least=1)
+    frame_skip: int = setting(4, at_least=1, at_most=MAX_FRAME_SKIP)
     forward_reward_weight: float = 1.0
     """Weight of the forward velocity."""
     ctrl_cost_weight: float = 1e-4

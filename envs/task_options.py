@@ -5,12 +5,16 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from mjx_walk.envs.models import model_path
 from mjx_walk.envs.reward_shaping import Shaping
 from mjx_walk.envs.state import NO_TIME_LIMIT
 from mjx_walk.envs.user_files import absolute_source
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import user_path
 from mjx_walk.utils.settings import setting
+
+MAX_FRAME_SKIP = 10_000
+"""With more, the physics of one environment step takes minutes and cannot be interrupted."""
 
 
 @dataclasses.dataclass
@@ -22,7 +26,7 @@ class TaskOptions:
     """Version of Gymnasium's environment."""
     xml_file: str | None = None
     """Model file: a path, or the name of one of Gymnasium's assets. Default: the version's own model."""
-    frame_skip: int = setting(5, at_least=1)
+    frame_skip: int = setting(5, at_least=1, at_most=MAX_FRAME_SKIP)
     """Physics steps of one environment step."""
     max_episode_steps: int = setting(1000, at_least=1, at_most=NO_TIME_LIMIT)
     """Time limit, in environment steps."""
@@ -34,6 +38,7 @@ class TaskOptions:
     """`PATH.py:CLASS`, for a task of your own from a file; see `mjx_walk.envs.registry`."""
 
     def __post_init__(self):
+        self.xml_file = self.xml_file or None
         for name, value in list(vars(self).items()):
             if isinstance(value, list):  # a configuration file gives a range as a list
                 setattr(self, name, tuple(value))
@@ -50,7 +55,10 @@ class TaskOptions:
 
     def gymnasium_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of Gymnasium's class for the equivalent environment, without those at their default."""
-        return {name: value for name, value in self.changed().items() if name not in _NOT_IN_GYMNASIUM}
+        keywords = {name: value for name, value in self.changed().items() if name not in _NOT_IN_GYMNASIUM}
+        if self.xml_file:  # Gymnasium finds relative paths elsewhere
+            keywords["xml_file"] = str(model_path(self.xml_file).absolute())
+        return keywords
 
 
 _NOT_IN_GYMNASIUM = ("name", "version", "max_episode_steps", "shaping", "reward_function", "task")

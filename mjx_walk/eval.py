@@ -63,7 +63,7 @@ def _save(folder: RunFolder, run: Run, scores: Scores) -> None:
         except ValueError as error:
             warnings.warn(f"{error}; it is replaced", stacklevel=2)
     own = {run.policy_name: scores.block(**run.policy_facts)}
-    write_scores(folder.gymnasium_scores, scores.env, blocks | own, **facts)
+    write_scores(folder.gymnasium_scores, scores.env, blocks | own, facts)
 
 
 if __name__ == "__main__":

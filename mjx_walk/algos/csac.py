@@ -24,7 +24,7 @@ class CSACConfig(SACConfig):
     """Settings of categorical SAC."""
 
     name: str = setting("csac", choices=("csac",))
-    num_atoms: int = setting(101, at_least=2)
+    num_atoms: int = setting(101, at_least=2, at_most=10_000)
     """Atoms of the return distribution, evenly spaced from `-normalized_return_max` to `normalized_return_max`; the
     latter is v_max in C51."""
     normalize_rewards: bool = True

@@ -29,7 +29,7 @@ class OnPolicyConfig:
 
     unroll_length: int = setting(10, at_least=1)
     """Steps of one unroll, over which advantages are estimated."""
-    num_unrolls: int = setting(4, at_least=1)
+    num_unrolls: int = setting(4, at_least=1, at_most=2**31 - 1)
     """Unrolls of every environment in one batch."""
     normalizer_warmup_steps_per_env: int = setting(16, at_least=0)
     """First steps of each environment, whose batches only set the scale of observations and rewards. Ten are too few on

@@ -33,7 +33,7 @@ class PolicyGradientConfig(OnPolicyConfig):
     """`tanh_normal` diverges here: nothing holds the mean back where tanh is flat."""
     mean_bound_coef: float = setting(1.0, at_least=0, only_if={"distribution": "normal"})
     """Coefficient of the squared distance of a `normal` distribution's mean from [-1, 1], where samples are clipped."""
-    num_unrolls: int = setting(1, at_least=1)
+    num_unrolls: int = setting(1, at_least=1, at_most=2**31 - 1)
     num_minibatches: int = setting(1, at_least=1)
     """Gradient steps on a batch, each on its own random share of the steps."""
 

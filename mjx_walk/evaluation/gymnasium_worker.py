@@ -26,8 +26,9 @@ def serve() -> None:
     warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
     import gymnasium
 
-    from mjx_walk.utils.quiet_mujoco import hide_deprecations
+    from mjx_walk.utils.quiet_mujoco import hide_deprecations, write_no_log
 
+    write_no_log()
     gymnasium.logger.min_level = gymnasium.logger.ERROR
     name, keywords, seeds = pickle.load(sys.stdin.buffer)
     with hide_deprecations():

@@ -25,7 +25,7 @@ from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.saved_config import differences, in_short, read_saved_config
 from mjx_walk.utils.devices import only_device
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import open_to_append, user_path
+from mjx_walk.utils.files import open_to_append, refuse_links, user_path
 from mjx_walk.utils.locks import locked
 from mjx_walk.utils.signals import Interrupt
 from mjx_walk.utils.subprocesses import start_module
@@ -96,7 +96,7 @@ def plan(
         The folder and the runs.
 
     Raises:
-        UserError: any run has an invalid setting, or its folder holds another run.
+        UserError: any run has an invalid setting, or its folder holds another run or is a link.
     """
     choices = [[f"algo={algo}" for algo in algos], *_choices(overrides, hardware)]
     first = load_config([options[0] for options in choices])
@@ -110,6 +110,7 @@ def plan(
         parts = (text.replace("=", "-") for text in texts)
         variant = "_".join(re.sub(r"[^\w.+-]+", "_", part) for part in parts)
         run_dir = folder / variant / f"seed_{seed}"
+        refuse_links(run_dir, folder)
         config = dataclasses.replace(load_config(list(chosen)), seed=seed, run_dir=str(run_dir))
         run = PlannedRun(variant, chosen, config)
         if runs.setdefault(run.name, run).config != run.config:
@@ -201,6 +202,8 @@ def start_job(job: list[PlannedRun], log: Path, device: int | None, share: int, 
     if is_resumed:
         arguments.append("resume=true")
     log.parent.mkdir(parents=True, exist_ok=True)
+    if log.is_file() and log.stat().st_nlink > 1:  # it is also another file, which must not grow
+        log.unlink()
     with os.fdopen(open_to_append(log), "a") as file:
         return start_module("train", *arguments, env=env, stdout=file, stderr=subprocess.STDOUT, pass_fds=(lock,))
 
@@ -234,6 +237,7 @@ def run_jobs(
                 while waiting and free:
                     job, device = waiting.pop(0), free.pop(0)
                     log = logs / _log_name(job)
+                    refuse_links(log, logs.parent)
                     running[start_job(job, log, device, share, lock)] = (job, log, device)
                 time.sleep(0.5)
                 for process in [process for process in running if process.poll() is not None]:
@@ -268,6 +272,7 @@ def _lock(folder: Path) -> Iterator[int]:
     Raises:
         UserError: another comparison holds the lock, or the folder cannot be written to.
     """
+    refuse_links(folder, folder.parent)
     in_use = f"runs of {folder.parent} are still being trained; wait for them, or stop them"
     with contextlib.ExitStack() as held:
         try:

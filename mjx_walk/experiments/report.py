@@ -12,7 +12,7 @@ from mjx_walk.experiments.logged_runs import MIN_SEEDS_FOR_IQM, LoggedRun, inter
 from mjx_walk.runs.metrics import write_csv
 from mjx_walk.runs.scores import BEST, FINAL
 from mjx_walk.utils.files import replacing, write_text
-from mjx_walk.utils.text import format_score
+from mjx_walk.utils.text import format_score, in_markdown
 from mjx_walk.viewing.run_plots import evaluations, learning_axes, series
 
 DRAWN = (
@@ -70,7 +70,7 @@ def draw_curves(axes: Axes, groups: dict[str, list[LoggedRun]], quantity: str, k
                 end = (run.rows[-1][key] / unit, run.score(FINAL)["mean"])
                 axes.plot(*end, "*", color=color, markersize=12, markeredgecolor="white", markeredgewidth=0.7, zorder=3)
         x, mean, values = mean_curve(curves)
-        axes.plot(x, mean, color=color, linewidth=2.2, label=f"{name} ({len(curves)})".replace("$", r"\$"))
+        axes.plot(x, mean, color=color, linewidth=2.2, label=f"{name} ({len(curves)})")
         bounds = interval(values)
         if bounds:
             axes.fill_between(x, *bounds, color=color, alpha=0.2, linewidth=0)
@@ -98,8 +98,8 @@ def _markdown(groups: dict[str, list[LoggedRun]]) -> str:
 
 
 def table(rows: list[dict[str, str]]) -> str:
-    """A Markdown table of at least one row; all rows have the same columns."""
-    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
+    """A Markdown table of at least one row; all rows have the same columns. Cells may hold text of strangers."""
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(map(in_markdown, row.values()) for row in rows)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 

@@ -16,8 +16,9 @@ from mjx_walk.experiments.report import DRAWN, LEGEND, csv_row, draw_curves, run
 from mjx_walk.runs.metrics import write_csv
 from mjx_walk.runs.scores import BEST, FINAL
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import replacing, user_path, write_text
+from mjx_walk.utils.files import refuse_links, replacing, user_path, write_text
 from mjx_walk.utils.text import format_score
+from mjx_walk.viewing.figures import standard_style
 from mjx_walk.viewing.run_plots import THOUSANDS
 
 SUITES = {"mujoco": tuple(BUILT_IN_TASKS)}
@@ -58,11 +59,13 @@ def plan_suite(
     folder = user_path(out or f"runs/compare_{suite}")
     runs = []
     for env in SUITES[suite]:
+        refuse_links(folder / env, folder)
         _, planned = planned_runs.plan([f"env={env}", *overrides], algos, seeds, str(folder / env), hardware)
         runs += [PlannedRun(f"{env}/{run.variant}", run.overrides, run.config) for run in planned]
     return folder, runs
 
 
+@standard_style()
 def write_report(folder: Path) -> Path:
     """Write `comparison.png`, `comparison.md` and `comparison.csv` about all runs below a folder.
 
@@ -181,7 +184,7 @@ def _draw(tasks: Tasks, path: Path) -> None:
         draw_curves(axes, groups, "return", "env_steps", 1e6)
         if task in REFERENCES:
             axes.axhline(REFERENCES[task][1], color="0.4", linewidth=1, linestyle=":", label="reference")
-        axes.set_title(task, fontsize=10, parse_math=False)
+        axes.set_title(task, fontsize=10)
         axes.yaxis.set_major_formatter(THOUSANDS)
         axes.grid(alpha=0.3)
     for axes in panels[len(tasks) :]:

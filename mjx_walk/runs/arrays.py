@@ -20,7 +20,7 @@ import numpy as np
 import tensorstore
 
 from mjx_walk.utils.errors import UserError, failed_read
-from mjx_walk.utils.files import write_text
+from mjx_walk.utils.files import open_to_read, write_text
 
 __all__ = ["HostArrays", "read_arrays", "write_arrays"]
 
@@ -28,6 +28,12 @@ _NUMPY = "arrays.npz"
 """File that replaces Orbax's files for small pytrees, and in folders of earlier versions for other processes."""
 _METADATA = "_METADATA"
 """Orbax's file about the arrays in a folder."""
+
+_MAX_OVERHEAD, _MAX_OVERHEAD_OF_NUMPY = 100_000_000, 10_000_000
+"""Bytes of a folder beyond twice those of its arrays. TensorStore ends the process if its index exceeds the memory,
+and Python keeps each entry of an archive's directory there."""
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""What NumPy writes. Python would unpack other kinds without a limit of their memory."""
 
 HostArrays = dict[str, np.ndarray]
 """Host copies of a pytree's leaves, by path."""
@@ -140,6 +146,7 @@ def read_arrays(path: Path, expected: Mapping[str, Any], present_name: Callable[
     """
     read = _read_numpy if (path / _NUMPY).exists() else _read_orbax
     try:
+        _check_size(path, expected, _MAX_OVERHEAD_OF_NUMPY if read is _read_numpy else _MAX_OVERHEAD)
         with _as_os_error(path):
             return read(path, expected, present_name)
     except (UserError, MemoryError):
@@ -152,24 +159,34 @@ def read_arrays(path: Path, expected: Mapping[str, Any], present_name: Callable[
 
 
 def _read_numpy(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:
-    arrays = {}
-    with zipfile.ZipFile(path / _NUMPY) as archive:
+    arrays: HostArrays = {}
+    with open_to_read(path / _NUMPY) as content, zipfile.ZipFile(content) as archive:
         for member in archive.infolist():
             name = present_name(member.filename.removesuffix(".npy"))
-            if name not in expected:
-                continue
-            with archive.open(member) as file:
-                if np.lib.format.read_magic(file) != (1, 0):
-                    raise ValueError(f"{name} has another version of NumPy's format")
-                shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-                _check(path, name, expected[name], shape, dtype)
-                if member.file_size != file.tell() + math.prod(shape) * dtype.itemsize:
-                    raise ValueError(f"{name} has another size than its header says")
-            with archive.open(member) as file:
-                arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
-            if dtype.kind == "V":  # NumPy's files do not support bfloat16
-                arrays[name] = arrays[name].view(expected[name].dtype)
+            if name in arrays:  # ten thousand entries may share the bytes of one
+                raise ValueError(f"{name} is there twice")
+            if name in expected:
+                arrays[name] = _read_member(path, archive, member, name, expected[name])
     return arrays
+
+
+def _read_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, expected: Any) -> np.ndarray:
+    """Read an array of a NumPy archive, after a look at its header."""
+    if member.compress_type not in _COMPRESSIONS:
+        raise ValueError(f"{name} is compressed in another way than NumPy does")
+    with archive.open(member) as file:
+        if np.lib.format.read_magic(file) != (1, 0):
+            raise ValueError(f"{name} has another version of NumPy's format")
+        try:
+            shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+        except MemoryError as error:  # so Python's parser reports deep nesting
+            raise ValueError(f"the header of {name} cannot be read") from error
+        _check(path, name, expected, shape, dtype)
+        if member.file_size != file.tell() + math.prod(shape) * dtype.itemsize:
+            raise ValueError(f"{name} has another size than its header says")
+    with archive.open(member) as file:
+        array = np.lib.format.read_array(file, allow_pickle=False)
+    return array.view(expected.dtype) if dtype.kind == "V" else array  # NumPy's files do not support bfloat16
 
 
 def _read_orbax(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:
@@ -193,6 +210,13 @@ def _read_orbax(path: Path, expected: Mapping[str, Any], present_name: Callable[
                 raise ValueError(f"{name} has larger pieces than its shape")
         reading = {name: store.read() for name, store in stores.items()}
         return {name: np.asarray(future.result()) for name, future in reading.items()}
+
+
+def _check_size(path: Path, expected: Mapping[str, Any], overhead: int) -> None:
+    """Check that the files of a folder are not much larger than the expected arrays."""
+    most = 2 * sum(math.prod(array.shape) * array.dtype.itemsize for array in expected.values()) + overhead
+    if sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) > most:
+        raise ValueError(f"it has more than {most:,} bytes, twice what its arrays have")
 
 
 def _check(path: Path, name: str, expected: Any, shape: tuple[int, ...], dtype: np.dtype) -> None:

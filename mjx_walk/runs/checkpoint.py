@@ -16,9 +16,10 @@ import numpy as np
 
 from mjx_walk.runs.arrays import HostArrays, read_arrays, write_arrays
 from mjx_walk.runs.facts import FORMAT, read_facts, write_facts
+from mjx_walk.runs.saved_yaml import MAX_BYTES
 from mjx_walk.runs.scores import POLICIES
 from mjx_walk.utils.errors import UnreadableError, UserError, failed_read
-from mjx_walk.utils.files import write_text
+from mjx_walk.utils.files import read_bytes, write_text
 from mjx_walk.utils.folders import discard, find_written, remove_unfinished, replacing_folder
 from mjx_walk.utils.versions import __version__
 
@@ -90,9 +91,11 @@ def config_copy(path: Path) -> Path | None:
         return None
     copy = path / _CONFIG
     try:
-        is_damaged = zlib.crc32(copy.read_bytes()) != checksum
+        is_damaged = zlib.crc32(read_bytes(copy, MAX_BYTES)) != checksum
     except OSError as error:
         raise failed_read(path, error) from error
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {copy.name}: {error}") from error
     if is_damaged:
         raise ValueError(f"{path} is damaged: {copy.name} does not match its checksum")
     return copy

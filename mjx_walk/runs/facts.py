@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mjx_walk.utils.checksums import take_checksum, with_checksum
+from mjx_walk.utils.checksums import read_json, take_checksum, with_checksum
 from mjx_walk.utils.errors import failed_read
 from mjx_walk.utils.files import write_text
 from mjx_walk.utils.versions import __version__
@@ -15,7 +15,7 @@ __all__ = ["FORMAT", "read_facts", "write_facts"]
 FORMAT = 1
 """Version of the checkpoint format. Increment it when a change makes older checkpoints unreadable."""
 
-_MAX_BYTES = 10_000_000
+_MAX_BYTES = 2_000_000
 _MAX_NUMBER = 1e300
 _REQUIRED = ("env_steps", "crc32")
 
@@ -37,12 +37,10 @@ def read_facts(path: Path) -> dict[str, Any]:
         ValueError: the file is missing, a fact is not what it should be, or the checksum does not match.
     """
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ValueError(f"it is larger than {_MAX_BYTES:,} bytes")
-        facts = json.loads(path.read_text(encoding="utf-8"))
+        facts = read_json(path, _MAX_BYTES)
     except OSError as error:
         raise failed_read(path.parent, error) from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ValueError(f"{path.parent} is damaged: {path.name}: {error}") from error
     if not isinstance(facts, dict):
         raise ValueError(f"{path} should be a JSON object, found {_shown(facts)}")

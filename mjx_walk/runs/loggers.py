@@ -18,10 +18,11 @@ from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.tensorboard import EventFile
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import Appender, replacing, write_text
+from mjx_walk.utils.files import Appender, read_bytes, replacing, write_text
 
 __all__ = ["MetricsWriter", "WandbLog", "require_wandb"]
 
+_MAX_ID_BYTES = 1000
 _LOG_ROWS, _LOG_CHECKSUM = "log_rows", "log_crc32"
 
 
@@ -142,7 +143,7 @@ class WandbLog:
         file = folder.path / "wandb_id.txt"
         if not file.exists():
             write_text(file, secrets.token_hex(4))
-        identity = file.read_text(encoding="utf-8", errors="replace").strip()
+        identity = read_bytes(file, _MAX_ID_BYTES).decode(errors="replace").strip()
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", identity):
             raise UserError(f"{file} does not hold the ID of a run of Weights & Biases; remove the file")
         self._run: Any = wandb.init(

@@ -3,12 +3,14 @@
 import csv
 import json
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mjx_walk.utils.files import replacing
+from mjx_walk.utils.errors import UserError, failed_read
+from mjx_walk.utils.files import open_to_read, replacing
 from mjx_walk.utils.types import Metrics, Reduction
 
 __all__ = ["Row", "name_metrics", "physics_warnings", "read_rows", "write_csv"]
@@ -17,6 +19,18 @@ Row = dict[str, float]
 """One line of `metrics.jsonl`. `name_metrics` lists the names."""
 
 _MAX_NUMBER = 1e300
+_MAX_LINE = 10_000_000
+"""Bytes of a row; a usual one has about a thousand."""
+_MAX_VALUES = 8_000_000
+"""Values of all rows, of which a usual one has about thirty. They take half a gigabyte."""
+_VALUES_PER_ROW = 8
+"""Values that take as much memory as an empty row."""
+_MAX_LINES = 1_000_000
+_MAX_NAME = 10_000
+_FORMULA = ("=", "+", "-", "@")
+"""What a spreadsheet takes for the start of a formula."""
+_MAX_CELLS = 20_000_000
+"""Cells of a CSV file, with the empty ones. A stranger's rows may each have names of their own."""
 _MANY = 0.01
 """Fraction of non-finite steps above which the physics is not the likely reason."""
 
@@ -82,16 +96,39 @@ def read_rows(path: Path) -> list[Row]:
     """All rows of a `metrics.jsonl`. Invalid lines are skipped, and one warning counts them.
 
     A last line that a crash has cut off is skipped silently.
+
+    Raises:
+        UserError: it is far larger than the log of a run, is not a regular file, or cannot be read.
     """
-    if not path.exists():
+    rows: list[Row] = []
+    names: dict[str, str] = {}  # one copy of each name for all rows
+    first_invalid, num_invalid, num_values = 0, 0, 0
+    row: Row | None = {}
+    try:
+        for number, line in enumerate(_lines(path), start=1):
+            if row is None:
+                first_invalid, num_invalid = first_invalid or number - 1, num_invalid + 1
+            row = _as_row(line)
+            if row is not None:
+                rows.append({names.setdefault(name, name): value for name, value in row.items()})
+                num_values += len(row) + _VALUES_PER_ROW
+            if num_values > _MAX_VALUES or number > _MAX_LINES:
+                raise UserError(f"{path} has too many rows for the log of a run; remove it, or some of its lines")
+    except FileNotFoundError:
         return []
-    lines = path.read_text(errors="replace").splitlines()
-    found = [_as_row(line) for line in lines]
-    invalid = [number for number, row in enumerate(found[:-1], start=1) if row is None]
-    if invalid:
-        more = f" and {len(invalid) - 1} more" if len(invalid) > 1 else ""
-        warnings.warn(f"line {invalid[0]}{more} of {path} cannot be read and is skipped", stacklevel=2)
-    return [row for row in found if row is not None]
+    except OSError as error:
+        raise UserError(str(failed_read(path, error))) from error
+    if num_invalid:
+        more = f" and {num_invalid - 1} more" if num_invalid > 1 else ""
+        warnings.warn(f"line {first_invalid}{more} of {path} cannot be read and is skipped", stacklevel=2)
+    return rows
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """The lines of a file, of which one that is too long to be a row comes in parts."""
+    with open_to_read(path) as file:
+        while line := file.readline(_MAX_LINE):
+            yield line.decode(errors="replace")
 
 
 def _as_row(line: str) -> Row | None:
@@ -111,14 +148,23 @@ def _is_value(value: Any) -> bool:
 
 def _is_name(name: str) -> bool:
     """Whether a metric's name is one that a spreadsheet does not take for a formula, and a terminal can show."""
-    return name[:1].isalpha() and name.isprintable()
+    return name[:1].isalpha() and name.isprintable() and len(name) <= _MAX_NAME
 
 
 def write_csv(rows: list[Row], path: Path) -> Path:
-    """Write rows as CSV with a column for every name in any row. Missing values are empty."""
-    names = dict.fromkeys(name for row in rows for name in row)
+    """Write rows as CSV with a column for every name in any row. Missing values are empty.
+
+    The last names are left out if there were too many cells.
+    """
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    most = max(_MAX_CELLS // max(len(rows), 1), 1)
     with replacing(path) as new, new.open("w", newline="") as file:
-        writer = csv.DictWriter(file, names)
+        writer = csv.DictWriter(file, names[:most], extrasaction="ignore")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({name: _as_cell(value) for name, value in row.items()} for row in rows)
     return path
+
+
+def _as_cell(value: Any) -> Any:
+    """A value that a spreadsheet does not take for a formula."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value

@@ -10,7 +10,7 @@ from mjx_walk.runs.config import Config
 from mjx_walk.runs.run_folder import RunFolder, new_path, open_existing
 from mjx_walk.runs.saved_config import differences, in_short, name_same_file, read_saved_config, save_config
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import is_unfinished, sync
+from mjx_walk.utils.files import is_unfinished, refuse_links, sync
 from mjx_walk.utils.locks import locked
 
 __all__ = ["locked_folder", "prepared"]
@@ -31,8 +31,8 @@ def prepared(configs: list[Config]) -> Iterator[tuple[list[RunFolder], list[Conf
         The folders, and the configurations with `run_dir` filled in.
 
     Raises:
-        UserError: a folder holds other files or another run, or is in use. When resuming: the configuration differs, or
-            the runs cannot train together.
+        UserError: a folder holds other files or another run, is in use, or is one of several and a link. When
+            resuming: the configuration differs, or the runs cannot train together.
     """
     first = configs[0]
     if first.run_dir is None:
@@ -40,6 +40,9 @@ def prepared(configs: list[Config]) -> Iterator[tuple[list[RunFolder], list[Conf
             raise UserError("resume=true needs run_dir=PATH of the run to continue")
         configs = [dataclasses.replace(config, run_dir=str(new_path(config))) for config in configs]
     folders = [RunFolder(Path(str(config.run_dir))) for config in configs]
+    if len(folders) > 1:  # the user has named only the folder above them
+        for folder in folders:
+            refuse_links(folder.path, folder.path.parent)
     _check_all(folders, configs)
     with contextlib.ExitStack() as locks:
         for folder in folders:

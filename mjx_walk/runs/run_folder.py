@@ -90,9 +90,11 @@ def open_existing(path: str | Path | None) -> RunFolder:
     if path is None:
         raise UserError("say which run: run=RUN_DIR")
     folder = RunFolder(user_path(path))
+    # Links and pipes are refused before anything is read, but not in a folder that is no run.
+    if os.path.lexists(folder.config) or folder.checkpoints.is_dir():
+        _refuse_special_files(folder.path)
     if not folder.is_run:
         raise UserError(f"no run at '{path}': {_where_a_run_is(folder.path)}")
-    _refuse_special_files(folder.path)
     for path in (folder.config, folder.metrics, folder.gymnasium_scores):
         if path.is_dir():
             raise UserError(f"'{path}' is a folder, where a run has a file; remove it")

@@ -2,12 +2,13 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mjx_walk.utils.checksums import take_checksum, with_checksum
+from mjx_walk.utils.checksums import read_json, take_checksum, with_checksum
 from mjx_walk.utils.files import write_text
 from mjx_walk.utils.versions import package_versions
 
@@ -22,6 +23,8 @@ BETTER = "better"
 """The better of both, chosen on the scored episodes themselves: what a file with one block holds."""
 
 _MAX_NUMBER = 1e300
+_MAX_BYTES = 10_000_000
+"""About 125,000 episodes of both policies."""
 
 
 @dataclasses.dataclass
@@ -84,16 +87,18 @@ class ScoreFile:
         return next((self.blocks[name] for name in names if name in self.blocks), None)
 
 
-def write_scores(path: Path, env: str, blocks: dict[str, dict[str, Any]], **facts: Any) -> None:
+def write_scores(path: Path, env: str, blocks: dict[str, dict[str, Any]], facts: Mapping[str, Any]) -> None:
     """Write scores as JSON, with the versions of the packages and a checksum.
 
     Args:
         path: file to replace.
         env: Gymnasium's id of the environment.
         blocks: `Scores.block` of each scored policy, by its name.
-        facts: JSON-serializable facts about the run.
+        facts: JSON-serializable facts about the run. They do not replace the scores, whatever their names are.
     """
-    content = {"env": env, **blocks, **facts} | {"versions": package_versions()}
+    scores = {"env": env, **blocks}
+    others = {name: fact for name, fact in facts.items() if name not in scores}
+    content = scores | others | {"versions": package_versions()}
     write_text(path, json.dumps(with_checksum(content), indent=1))
 
 
@@ -102,11 +107,12 @@ def read_scores(path: Path) -> ScoreFile:
 
     Raises:
         ValueError: the file is not of this format, or was changed.
+        OSError: it is not a regular file, or cannot be read.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except RecursionError as error:
-        raise ValueError(f"{path} is nested too deeply") from error
+        content = read_json(path, _MAX_BYTES)
+    except ValueError as error:
+        raise ValueError(f"{path} holds no scores: {error}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path} holds no object")
     if not take_checksum(content):

@@ -12,7 +12,7 @@ from pathlib import Path
 from mjx_walk.utils.devices import count_devices, only_device
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.signals import Interrupt, exit_code
-from mjx_walk.utils.subprocesses import PYTHON
+from mjx_walk.utils.subprocesses import python
 
 _log = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ def _start(arguments: list[str], size: int, logs: Path) -> list[subprocess.Popen
             output = log if rank else None
             processes.append(
                 subprocess.Popen(
-                    [*PYTHON, "-m", "mjx_walk.train", *arguments],
+                    [*python(), "-m", "mjx_walk.train", *arguments],
                     env=env,
                     stdout=output,
                     stderr=output,

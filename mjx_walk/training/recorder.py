@@ -160,7 +160,7 @@ class Recorder:
 
         try:
             plot_run(self._folder)
-        except OSError as error:
+        except (OSError, UserError) as error:
             _log.warning(f"cannot draw the curves of {self._folder.path}: {error}; draw them with mjx_walk.plots")
         final: Any = self._algorithm.policy_params(state)
         facts: dict[str, Any] = {"env_steps": env_steps}
@@ -195,7 +195,7 @@ class Recorder:
             scored[name] = (scores, facts["env_steps"])
             blocks[name] = scores.block(**facts)
         with self._writing():
-            write_scores(self._folder.gymnasium_scores, self._task.gymnasium_id, blocks, wall_seconds=wall_seconds)
+            write_scores(self._folder.gymnasium_scores, self._task.gymnasium_id, blocks, {"wall_seconds": wall_seconds})
         return scored
 
     def wait(self) -> None:

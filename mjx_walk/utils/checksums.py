@@ -1,12 +1,33 @@
-"""Checksums of JSON objects, so that a changed digit is noticed."""
+"""JSON objects with a checksum, so that a change of a file is noticed, and that strangers may have written."""
 
 import json
 import zlib
+from pathlib import Path
 from typing import Any
 
-__all__ = ["take_checksum", "with_checksum"]
+from mjx_walk.utils.files import read_bytes
+
+__all__ = ["read_json", "take_checksum", "with_checksum"]
 
 _KEY = "checksum"
+_MAX_DEPTH = 20
+"""Deepest nesting that is read. Python writes far less deep objects than it reads."""
+
+
+def read_json(path: Path, max_bytes: int) -> Any:
+    """Content of a JSON file.
+
+    Raises:
+        ValueError: it is too large, nested too deeply, or not JSON in UTF-8.
+        OSError: it is not a regular file, or cannot be read.
+    """
+    try:
+        content = json.loads(read_bytes(path, max_bytes).decode())
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    if not _is_shallow(content, _MAX_DEPTH):
+        raise ValueError("it is nested too deeply")
+    return content
 
 
 def with_checksum(content: dict[str, Any]) -> dict[str, Any]:
@@ -26,3 +47,10 @@ def take_checksum(content: dict[str, Any]) -> bool:
 
 def _checksum(content: dict[str, Any]) -> int:
     return zlib.crc32(json.dumps(content, sort_keys=True).encode())
+
+
+def _is_shallow(value: Any, depth: int) -> bool:
+    if not isinstance(value, dict | list):
+        return True
+    parts = value.values() if isinstance(value, dict) else value
+    return depth > 0 and all(_is_shallow(part, depth - 1) for part in parts)

@@ -29,6 +29,7 @@ from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.settings import validate
 from mjx_walk.utils.signals import Stopped, exit_code
 from mjx_walk.utils.subprocesses import end_with_parent
+from mjx_walk.utils.text import printable
 from mjx_walk.utils.value_types import plain_type, type_mistake, with_whole_number
 from mjx_walk.utils.versions import __version__
 
@@ -252,7 +253,7 @@ def _exit_code_of(command: Callable[[list[str]], int | None]) -> int:
     except OSError as error:
         if error.errno not in _DISK_ERRORS:
             raise
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(str(error))}", file=sys.stderr)
         return 2
     except Stopped as stopped:
         print(f"Stopped by {stopped.signal_name}.", file=sys.stderr)

@@ -8,6 +8,8 @@ import warnings
 from collections.abc import Iterator
 from typing import IO, Any
 
+from mjx_walk.utils.text import printable
+
 __all__ = ["console"]
 
 _usual_format = warnings.formatwarning
@@ -71,7 +73,7 @@ def _in_one_line(
 ) -> str:
     """Format a warning for users as one line, without its source code."""
     if category is UserWarning:
-        return f"warning: {message}\n"
+        return f"warning: {printable(str(message))}\n"
     return _usual_format(message, category, filename, lineno, line)
 
 

@@ -2,13 +2,13 @@
 
 import os
 import subprocess
-import sys
 from collections.abc import Callable
 from typing import Any
 
 import jax
 
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.subprocesses import python
 
 
 def count_devices() -> tuple[str, int]:
@@ -20,7 +20,7 @@ def count_devices() -> tuple[str, int]:
         UserError: JAX does not start.
     """
     code = "import jax; print(jax.default_backend() != 'cpu', jax.local_device_count())"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run([*python(), "-c", code], capture_output=True, text=True, check=False)
     if done.returncode:
         raise UserError(f"JAX does not start: {done.stderr.strip().splitlines()[-1]}")
     is_gpu, count = done.stdout.split()[-2:]

@@ -3,11 +3,17 @@
 import errno
 from pathlib import Path
 
+from mjx_walk.utils.text import printable
+
 _IS_DAMAGE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, None)
 
 
 class UserError(ValueError):
     """Invalid input. Commands print its one-line message without a traceback and exit with code 2."""
+
+    def __str__(self) -> str:
+        # A file's name, which a message quotes, may hold escape sequences and line breaks.
+        return printable(super().__str__())
 
 
 class UnreadableError(UserError):

@@ -5,30 +5,29 @@ import errno
 import os
 import re
 import secrets
-import unicodedata
+import stat
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.text import has_controls
 
 __all__ = [
     "Appender",
     "check_replaceable",
     "fresh_name",
-    "has_controls",
     "is_unfinished",
     "open_to_append",
+    "open_to_read",
+    "read_bytes",
+    "refuse_links",
     "replacing",
     "sync",
     "sync_tree",
     "user_path",
     "write_text",
 ]
-
-_CONTROLS = ("Cc", "Cs", "Zl", "Zp")
-"""Unicode's categories of control characters, lone surrogates, and separators of lines and paragraphs."""
-_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
-"""Unicode's directions of characters that reorder the text around them."""
 
 
 def user_path(path: str | Path) -> Path:
@@ -48,11 +47,6 @@ def user_path(path: str | Path) -> Path:
         return Path(text).expanduser()
     except RuntimeError as error:
         raise UserError(f"'{text}': there is no such home folder; for a folder of this name write ./{text}") from error
-
-
-def has_controls(text: str) -> bool:
-    """Whether a text has characters that control a terminal, reorder other characters, or are not Unicode."""
-    return any(unicodedata.category(c) in _CONTROLS or unicodedata.bidirectional(c) in _DIRECTIONS for c in text)
 
 
 @contextlib.contextmanager
@@ -130,6 +124,19 @@ def check_replaceable(path: Path) -> None:
         raise UserError(f"cannot write {path}: it is read-only; choose another path, or remove it")
 
 
+def refuse_links(path: Path, folder: Path) -> None:
+    """Check that no part of a path below a folder, which may be downloaded, is a link that leads elsewhere.
+
+    Raises:
+        UserError: a part is a symbolic link.
+    """
+    for part in (path, *path.parents):
+        if part == folder:
+            return
+        if part.is_symlink():
+            raise UserError(f"'{part}' is a symbolic link; replace it by what it points to")
+
+
 def fresh_name(path: Path) -> Path:
     """An unpredictable, hidden name in the same folder, with the same suffix."""
     return path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
@@ -147,16 +154,51 @@ def write_text(path: Path, text: str, mode: int = 0o666) -> None:
         new.write_text(text, encoding="utf-8")
 
 
+def open_to_read(path: Path) -> BinaryIO:
+    """Open a file that a stranger may have put there. A pipe or device, which blocks or never ends, is refused.
+
+    Raises:
+        OSError: not a regular file, or one that cannot be read.
+    """
+    return open(path, "rb", opener=_open_regular)
+
+
+def read_bytes(path: Path, max_bytes: int) -> bytes:
+    """Content of a file that a stranger may have written: no more is read than such a file ever holds.
+
+    Raises:
+        ValueError: it is larger.
+        OSError: as for `open_to_read`.
+    """
+    with open_to_read(path) as file:
+        content = file.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        raise ValueError(f"it is larger than {max_bytes:,} bytes")
+    return content
+
+
 def open_to_append(path: Path) -> int:
-    """Open a file to append to it, and create it if it does not exist. A symbolic link is refused.
+    """Open a file to append to it, and create it if it does not exist. Symbolic links, pipes and devices are refused.
 
     Returns:
         A file descriptor.
 
     Raises:
-        OSError: a symbolic link, or a file that cannot be written.
+        OSError: not a regular file, or one that cannot be written.
     """
-    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW, 0o666)
+    return _open_regular(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW)
+
+
+def _open_regular(path: str | Path, flags: int) -> int:
+    """Open a regular file. Without `O_NONBLOCK`, opening a pipe would wait for its other end."""
+    descriptor = os.open(path, flags | os.O_NONBLOCK, 0o666)
+    mode = os.fstat(descriptor).st_mode
+    if stat.S_ISREG(mode):
+        return descriptor
+    os.close(descriptor)
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    raise OSError(errno.EINVAL, "not a regular file", str(path))
 
 
 class Appender:

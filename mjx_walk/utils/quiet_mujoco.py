@@ -1,4 +1,4 @@
-"""MuJoCo's warnings while it loads a model. This module does not import JAX."""
+"""MuJoCo's warnings, and the file that it writes them to. This module does not import JAX."""
 
 import contextlib
 import warnings
@@ -7,12 +7,22 @@ from collections.abc import Iterator
 import mujoco
 
 
+def write_no_log() -> None:
+    """Stop MuJoCo from appending its warnings to `MUJOCO_LOG.TXT` in the working directory.
+
+    It would follow a link of that name, which a stranger may have put there. It still prints the warnings.
+    """
+    config = mujoco.MjLogConfig.get()
+    config.logto_file = False
+    config.set()
+
+
 @contextlib.contextmanager
 def hide_deprecations() -> Iterator[None]:
     """Hide MuJoCo's deprecation warnings, and turn its other warnings into Python's.
 
-    MuJoCo prints each warning to stderr and appends it to `MUJOCO_LOG.TXT` in the working directory. Every load of
-    Gymnasium's HalfCheetah warns of a deprecated attribute, which users cannot change.
+    MuJoCo prints each warning to stderr. Every load of Gymnasium's HalfCheetah warns of a deprecated attribute, which
+    users cannot change.
     """
     previous = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(_warn)

@@ -27,6 +27,8 @@ __all__ = [
 
 Schema = TypeVar("Schema")
 
+_MAX_ITEMS = 100
+"""Values that a list may have. Each layer of a network takes its time to compile."""
 _MAX_INT = 10**12
 """No count is larger. JAX cannot hold shapes from 2**63 elements on, and some of its errors end the process."""
 
@@ -90,7 +92,10 @@ def validate(config: Any, prefix: str = "") -> None:
         mistake = type_problem(value, hints[field.name])
         if mistake:
             raise UserError(f"{key}={value!r}: {mistake}")
-        for item in value if isinstance(value, list | tuple) else (value,):
+        items = value if isinstance(value, list | tuple) else (value,)
+        if len(items) > _MAX_ITEMS:
+            raise UserError(f"{key} has {len(items):,} values; give at most {_MAX_ITEMS}")
+        for item in items:
             problem = _problem(item, field.metadata)
             if problem:
                 raise UserError(f"{key}={value}: {problem}")

@@ -8,8 +8,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-PYTHON = [sys.executable, *(["-P"] if sys.flags.safe_path else [])]
-"""The command of this interpreter. With `-P` it imports nothing from the working directory."""
 _ROOT = Path(__file__).parents[2]
 _ENDED_BY_PARENT = "MJX_WALK_ENDED_BY"
 """Environment variable of a child process that must not outlive its parent: the parent's process id."""
@@ -32,11 +30,23 @@ def end_with_parent() -> None:
         signal.raise_signal(signal.SIGTERM)
 
 
+def python() -> list[str]:
+    """The command of this interpreter. A child imports modules of the working directory only if this process does.
+
+    With `-m` or `-c` and without `-P` it always would, and run what a downloaded folder has there.
+    """
+    try:
+        here = os.getcwd()
+    except FileNotFoundError:  # it was removed
+        return [sys.executable, "-P"]
+    imports_from_here = any(os.path.realpath(path) == here for path in sys.path)
+    return [sys.executable, *([] if imports_from_here else ["-P"])]
+
+
 def start_module(name: str, *arguments: str, env: dict[str, str] | None = None, **options: Any) -> subprocess.Popen:
     """Start `python -m mjx_walk.NAME ARGUMENTS` in a new session, so that Ctrl-C reaches only the parent.
 
-    The child imports the same copy of this package as its parent, and modules of the working directory only if the
-    parent does (`python -P`).
+    The child imports the same copy of this package as its parent.
 
     Args:
         name: module name without the package.
@@ -47,7 +57,7 @@ def start_module(name: str, *arguments: str, env: dict[str, str] | None = None, 
     # An empty part would stand for the working directory.
     paths = os.pathsep.join(filter(None, [str(_ROOT), os.environ.get("PYTHONPATH")]))
     return subprocess.Popen(
-        [*PYTHON, "-m", f"mjx_walk.{name}", *arguments],
+        [*python(), "-m", f"mjx_walk.{name}", *arguments],
         env=os.environ | {"PYTHONPATH": paths} | (env or {}),
         start_new_session=True,
         **options,

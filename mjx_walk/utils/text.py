@@ -1,8 +1,40 @@
-"""Numbers and times as people read them."""
+"""Numbers and times as people read them, and text of strangers that is safe to show."""
 
+import re
+import unicodedata
 from typing import SupportsFloat
 
-__all__ = ["duration", "format_score"]
+__all__ = ["duration", "format_score", "has_controls", "in_markdown", "printable"]
+
+_CONTROLS = ("Cc", "Cs", "Zl", "Zp")
+"""Unicode's categories of control characters, lone surrogates, and separators of lines and paragraphs."""
+_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
+"""Unicode's directions of characters that reorder the text around them."""
+_MAX_LENGTH = 2000
+"""Characters of a message; more would fill the screen."""
+_MARKUP = re.compile(r"[\\`|<>$]|\](?=\()")
+"""What begins an element, a formula or code in Markdown, makes a link, or ends a table's cell."""
+
+
+def has_controls(text: str) -> bool:
+    """Whether a text has characters that control a terminal, reorder other characters, or are not Unicode."""
+    return any(map(_is_control, text))
+
+
+def printable(text: str) -> str:
+    """A message in one line, in which characters that control a terminal are escaped. A long one loses its middle."""
+    half = _MAX_LENGTH // 2
+    shown = text if len(text) <= _MAX_LENGTH else f"{text[:half]} … {text[-half:]}"
+    return "".join(ascii(c)[1:-1] if _is_control(c) else c for c in shown)
+
+
+def in_markdown(text: str) -> str:
+    """Text that Markdown shows as it is, also in a table."""
+    return _MARKUP.sub(r"\\\g<0>", text)
+
+
+def _is_control(character: str) -> bool:
+    return unicodedata.category(character) in _CONTROLS or unicodedata.bidirectional(character) in _DIRECTIONS
 
 
 def format_score(value: SupportsFloat | None) -> str:

@@ -11,6 +11,7 @@ from matplotlib.gridspec import SubplotSpec
 from mjx_walk.utils.files import replacing
 from mjx_walk.utils.text import format_score
 from mjx_walk.viewing.episode import Episode
+from mjx_walk.viewing.figures import standard_style
 
 _NUM_FRAMES = 8
 _STRIP_SECONDS = 1.0
@@ -20,6 +21,7 @@ _NO_HEIGHT = 1e-6
 """Range of heights below which a body moves in a horizontal plane, m. Then its y is drawn instead."""
 
 
+@standard_style()
 def draw_gait_sheet(episode: Episode, path: Path) -> Path:
     """Draw a gait sheet: height and speed of the view's body over the complete episode, and details from its middle.
 

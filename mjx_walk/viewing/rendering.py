@@ -13,6 +13,7 @@ import numpy as np
 
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import replacing
+from mjx_walk.utils.subprocesses import python
 
 _RENDERERS = ("egl", "osmesa", "glfw")
 """Values of `MUJOCO_GL` that Gymnasium renders with; the last one needs a screen."""
@@ -50,7 +51,7 @@ def choose_opengl() -> None:
 def _works(name: str) -> bool:
     """Whether MuJoCo renders with a value of `MUJOCO_GL`. A broken driver may crash, so a child process tries it."""
     env = os.environ | {"MUJOCO_GL": name}
-    return not subprocess.run([sys.executable, "-c", _PROBE], env=env, capture_output=True, check=False).returncode
+    return not subprocess.run([*python(), "-c", _PROBE], env=env, capture_output=True, check=False).returncode
 
 
 def write_film(frames: list[np.ndarray], path: Path, frames_per_second: float) -> None:

@@ -14,6 +14,7 @@ from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.saved_config import read_saved_config
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import replacing
+from mjx_walk.viewing.figures import standard_style
 
 _X_AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))
 """Key of a row, unit and label of each horizontal axis."""
@@ -26,6 +27,7 @@ _FEW_POINTS = 20
 """Curves with fewer points show each of them, so that a single one is visible."""
 
 
+@standard_style()
 def plot_run(folder: RunFolder) -> list[Path]:
     """Draw the curves of a run into its folder.
 
@@ -97,7 +99,7 @@ def learning_axes(figure: matplotlib.figure.Figure) -> Iterator[tuple[Axes, str,
 
 def _learning_curve(rows: list[Row], title: str, path: Path) -> Path:
     figure = matplotlib.figure.Figure(figsize=(10, 6.5), layout="constrained")
-    figure.suptitle(title, parse_math=False)
+    figure.suptitle(title)
     for axes, quantity, key, unit in learning_axes(figure):
         x, y = series(rows, key, f"episode/{quantity}")
         if x.size:
@@ -123,14 +125,14 @@ def _grid(rows: list[Row], names: list[str], title: str, path: Path) -> Path:
     num_columns = min(len(names), 4) or 1
     num_rows = -(-len(names) // num_columns) or 1
     figure = matplotlib.figure.Figure(figsize=(3.4 * num_columns, 2.4 * num_rows + 0.4), layout="constrained")
-    figure.suptitle(title, parse_math=False)
+    figure.suptitle(title)
     plots = figure.subplots(num_rows, num_columns, squeeze=False, sharex=True)
     for unused in plots.flat[len(names) :]:
         unused.set_axis_off()
     for axes, name in zip(plots.flat, names, strict=False):
         x, y = series(rows, "env_steps", name)
         axes.plot(x / 1e6, y, marker=_marker(x))
-        axes.set_title(name.partition("/")[2], fontsize=9, parse_math=False)
+        axes.set_title(name.partition("/")[2], fontsize=9)
         axes.yaxis.set_major_formatter(THOUSANDS)
         axes.tick_params(labelsize=8, labelbottom=True)
         axes.grid(alpha=0.3)

@@ -61,9 +61,11 @@ def main(command_line: list[str]) -> None:
         folder.gymnasium_scores,
         scores.env,
         {BEST: scores.block(**run.policy_facts)},
-        command=training_command(config),
-        num_runs=arguments.num_runs,
-        runs_mean=scores.mean if arguments.runs_mean is None else arguments.runs_mean,
+        {
+            "command": training_command(config),
+            "num_runs": arguments.num_runs,
+            "runs_mean": scores.mean if arguments.runs_mean is None else arguments.runs_mean,
+        },
     )
     print(scores)
 

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import gymnasium
 import jax
+import mujoco
 import numpy as np
 import pytest
 from helpers import CLONE, TINY, train_here
 
 from mjx_walk.envs import TASKS, make_env
+from mjx_walk.envs.models import load_model
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.quiet_mujoco import hide_deprecations
 
@@ -171,3 +173,27 @@ def test_threads_step_one_task_in_turn():
     assert len(turns) == 120 and all(turns)
     for (qpos, *_), _, _ in together:
         np.testing.assert_array_equal(qpos, alone[0][0])
+
+
+def test_an_unstable_simulation_writes_nothing_into_the_working_directory(tmp_path, monkeypatch):
+    """MuJoCo's log would be written through a link that a downloaded folder has there."""
+    (tmp_path / "precious").write_text("mine")
+    (tmp_path / "MUJOCO_LOG.TXT").symlink_to("precious")
+    monkeypatch.chdir(tmp_path)
+    model = load_model("hopper.xml")
+    data = mujoco.MjData(model)
+    data.qpos[:] = 1e300
+    mujoco.mj_step(model, data)
+    assert data.warning.number.any() and (tmp_path / "precious").read_text() == "mine"
+
+
+@pytest.mark.parametrize("given", ["hopper.xml", "here/mine.xml", "./here/mine.xml", ""])
+def test_gymnasium_gets_the_same_file(given, tmp_path, monkeypatch):
+    """Gymnasium itself looks for a relative path among its assets."""
+    assets = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "mine.xml").write_bytes((assets / "hopper.xml").read_bytes())
+    monkeypatch.chdir(tmp_path)
+    keywords = make_env("hopper", physics="c", xml_file=given).gymnasium_kwargs()
+    expected = {"hopper.xml": assets / "hopper.xml", "": None}.get(given, tmp_path / "here" / "mine.xml")
+    assert keywords == ({"xml_file": str(expected)} if expected else {})

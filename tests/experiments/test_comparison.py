@@ -8,7 +8,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from helpers import command, command_here, finish, start, wait_for_rows
+from helpers import TINY, TINY_CALL, command, command_here, finish, start, wait_for_rows
 
 from mjx_walk import compare as compare_command
 from mjx_walk.envs import TASKS, make_options
@@ -316,6 +316,18 @@ def test_a_second_comparison_in_the_same_folder_waits_its_turn(tmp_path):
 def test_the_reason_of_a_failure_is_the_last_line_of_its_log(tmp_path, log, reason):
     (tmp_path / "log.txt").write_text(log)
     assert compare_command._reason(tmp_path / "log.txt") == reason
+
+
+@pytest.mark.parametrize("link", ["ppo", "logs", "logs/ppo"])
+def test_a_link_in_the_folder_of_a_comparison_is_refused(tmp_path, link, capsys):
+    """The folder may be downloaded; nothing is written where a link in it leads."""
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "out" / link).parent.mkdir(parents=True)
+    (tmp_path / "out" / link).symlink_to(tmp_path / "outside")
+    arguments = [*TINY, "algos=[ppo]", "seeds=1", f"total_steps={TINY_CALL}", f"out={tmp_path}/out"]
+    assert command_here("compare", *arguments) == 2
+    assert f"{link}' is a symbolic link" in capsys.readouterr().err
+    assert list((tmp_path / "outside").iterdir()) == []
 
 
 def test_a_run_that_fails_is_named(tmp_path, monkeypatch, capfd):

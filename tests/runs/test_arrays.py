@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import pickle
 import subprocess
 import sys
@@ -128,6 +129,39 @@ def test_a_member_that_is_not_what_it_says_is_damage(tmp_path, content):
     assert not isinstance(error.value, UserError) and "\n" not in str(error.value)
 
 
+def test_a_header_that_overwhelms_the_parser_is_damage(tmp_path):
+    header = b"{'descr': " + b"-" * 9000 + b"1}\n"
+    content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+    with pytest.raises(ValueError, match="is damaged: the header of a cannot be read"):
+        read_arrays(archive(tmp_path / "x", a=content), EXPECTED, same)
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_only_the_compression_of_numpy_is_read(tmp_path, compression):
+    (tmp_path / "x").mkdir()
+    with zipfile.ZipFile(tmp_path / "x" / "arrays.npz", "w", compression) as file:
+        file.writestr("a.npy", npy(EXPECTED["a"]))
+    with pytest.raises(ValueError, match="is damaged: a is compressed in another way"):
+        read_arrays(tmp_path / "x", EXPECTED, same)
+
+
+def test_an_archive_names_each_array_once_and_is_not_much_larger_than_its_arrays(tmp_path):
+    folder = archive(tmp_path / "x", a=npy(EXPECTED["a"]), former=npy(EXPECTED["a"]))
+    with pytest.raises(ValueError, match="is damaged: a is there twice"):
+        read_arrays(folder, EXPECTED, lambda name: "a")
+    with (folder / "arrays.npz").open("ab") as file:
+        file.write(bytes(11_000_000))
+    with pytest.raises(ValueError, match="is damaged: it has more than"):
+        read_arrays(folder, EXPECTED, same)
+
+
+def test_a_manifest_of_any_size_does_not_end_the_process(tmp_path):
+    write_arrays(tmp_path / "x", EXPECTED)
+    os.truncate(tmp_path / "x" / "manifest.ocdbt", 10**11)
+    with pytest.raises(ValueError, match="is damaged: it has more than"):
+        read_arrays(tmp_path / "x", EXPECTED, same)
+
+
 def test_a_pickle_in_an_archive_is_not_loaded(tmp_path, capsys):
     with pytest.raises(UserError, match=r"a should be \(2, 3\) float32, found \(2, 3\) object"):
         read_arrays(archive(tmp_path / "x", a=OBJECTS.getvalue()), EXPECTED, same)
@@ -249,8 +283,8 @@ def test_facts_that_are_no_facts_are_damage(tmp_path, text):
 def test_unknown_facts_are_ignored_and_facts_that_are_too_large_are_refused(tmp_path):
     path = saved(tmp_path, more={"deep": [1, {}]})
     assert checkpoint.restore(path, {"a": EXPECTED["a"]})[1]["env_steps"] == 10
-    (path / "meta.json").write_text(" " * 10_000_001)
-    with pytest.raises(ValueError, match="larger than 10,000,000 bytes"):
+    (path / "meta.json").write_text(" " * 2_000_001)
+    with pytest.raises(ValueError, match="larger than 2,000,000 bytes"):
         checkpoint.restore(path, {"a": EXPECTED["a"]})
 
 

@@ -144,7 +144,10 @@ def renamings(warned):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (b"run_dir: ${oc.env:HOME}\n", r"contains '\$\{', which no saved configuration does"),
+        (b"run_dir: ${oc.env:HOME}\n", r"line 1 of .* contains '\$\{', which no saved configuration does"),
+        (b'run_dir: "\\x24{oc.env:HOME}"\n', r"line 1 of .* contains '\$\{'"),
+        (b'run_dir: "$\\u007boc.env:HOME}"\n', r"line 1 of .* contains '\$\{'"),
+        (b'run_dir: "$\\\n  {oc.env:HOME}"\n', r"line 1 of .* contains '\$\{'"),
         (b"\xff\xfe", "is not a configuration of this version"),
         (b"run_dir: [\n", "is not a configuration of this version"),
         (b"seed: 1\n", "is not a configuration of this version"),

@@ -3,11 +3,14 @@
 import json
 import os
 
+import matplotlib
 import pytest
 
+from mjx_walk.runs import metrics
 from mjx_walk.runs.loggers import MetricsWriter
 from mjx_walk.runs.metrics import read_rows
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.run_plots import plot_run
 
 
@@ -128,6 +131,33 @@ def test_names_in_a_log_cannot_stop_the_plots(tmp_path, name):
     rows = [{"env_steps": step, "wall_seconds": step, name: 1.0, "train/loss": 1e299} for step in (1, 2**63)]
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     assert [path.stat().st_size > 100 for path in plot_run(RunFolder(tmp_path))] == [True] * 4
+
+
+@pytest.mark.parametrize("limit", ["_MAX_VALUES", "_MAX_LINES", "_MAX_LINE"])
+def test_a_log_of_any_size_takes_little_memory(tmp_path, monkeypatch, limit):
+    path = tmp_path / "metrics.jsonl"
+    monkeypatch.setattr(metrics, limit, 100)
+    if limit == "_MAX_LINE":
+        path.write_text(line(1) + "x" * 1000 + "\n" + line(2))
+        with pytest.warns(UserWarning, match="line 2 and 10 more of"):
+            assert [row["env_steps"] for row in read_rows(path)] == [1, 2]
+    else:
+        path.write_text(line(1) * 101)
+        with pytest.raises(UserError, match=r"metrics\.jsonl has too many rows for the log of a run; remove it"):
+            read_rows(path)
+
+
+def test_a_csv_file_has_a_limited_number_of_cells_and_no_formulas(tmp_path, monkeypatch):
+    monkeypatch.setattr(metrics, "_MAX_CELLS", 6)
+    rows = [{"run_dir": "=HYPERLINK(1)", f"train/{i}": -1.0} for i in range(3)]
+    text = metrics.write_csv(rows, tmp_path / "metrics.csv").read_text()
+    assert text.splitlines() == ["run_dir,train/0", "'=HYPERLINK(1),-1.0", "'=HYPERLINK(1),", "'=HYPERLINK(1),"]
+
+
+def test_a_matplotlibrc_of_the_working_directory_has_no_effect(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text(line(1))
+    with matplotlib.rc_context({"text.usetex": True, "font.size": 1e9, "figure.dpi": 1e9}):  # as it was read
+        assert len(plot_run(RunFolder(tmp_path))) == 4
 
 
 def test_a_log_of_many_names_draws_only_some(tmp_path):

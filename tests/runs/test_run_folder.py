@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import zlib
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from helpers import OLD_RUNS, command_here, train_here
 from mjx_walk import api
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.background_saver import BackgroundSaver, Part
-from mjx_walk.runs.run_folder import open_existing
+from mjx_walk.runs.facts import read_facts, write_facts
+from mjx_walk.runs.preparation import prepared
+from mjx_walk.runs.run_folder import RunFolder, open_existing
 from mjx_walk.runs.saved_config import in_short
 from mjx_walk.utils.errors import UserError
 
@@ -80,6 +83,50 @@ def test_a_pipe_in_a_run_folder_is_refused(downloaded, name):
     os.mkfifo(downloaded / name)
     with pytest.raises(UserError, match=f"{name}' is not a regular file; remove it"):
         open_existing(downloaded)
+
+
+@pytest.mark.parametrize("name", ["meta.json", "run_config.yaml"])
+@pytest.mark.parametrize("kind", ["pipe", "device", "large"])
+def test_without_a_configuration_no_copy_is_read_for_ever(downloaded, name, kind):
+    """Whether a folder is a run depends on its checkpoints then."""
+    (downloaded / "config.yaml").unlink()
+    folder = RunFolder(downloaded)
+    for path in (*checkpoint.list_steps(folder.checkpoints), folder.policy("best"), folder.policy("final")):
+        if path.is_dir():
+            copy, meta = path / "run_config.yaml", path / "meta.json"
+            copy.write_text("x")
+            write_facts(meta, read_facts(meta) | {"config_crc32": zlib.crc32(b"x")})
+            (path / name).unlink()
+            if kind == "pipe":
+                os.mkfifo(path / name)
+            elif kind == "device":
+                (path / name).symlink_to("/dev/zero")
+            else:
+                (path / name).touch()
+                os.truncate(path / name, 10**12)
+    assert not folder.is_run
+    with pytest.raises(UserError, match=r"is not a regular file|is a symbolic link|no run at"):
+        open_existing(downloaded)
+
+
+@pytest.mark.parametrize("name", ["\x1b]0;x\x07", "a\nerror: run this", "\u202egnp"])
+def test_a_message_escapes_the_names_in_a_folder(downloaded, name, capsys):
+    (downloaded / name).symlink_to("nowhere")
+    assert command_here("plots", f"run={downloaded}") == 2
+    line = capsys.readouterr().err
+    assert line.endswith("' is a symbolic link; replace it by what it points to\n") and line[:-1].isprintable()
+
+
+def test_of_several_seeds_none_is_a_link_to_another_run(downloaded, tmp_path):
+    """The command names only the folder above them, which may be downloaded too."""
+    mine = shutil.copytree(OLD_RUNS / "ppo", tmp_path / "mine")
+    before = contents(mine)
+    downloaded.rename(tmp_path / "seed_0")
+    (tmp_path / "seed_1").symlink_to(mine)
+    configs = api.resolve_seeds([f"run_dir={tmp_path}", "resume=true"], [0, 1])
+    with pytest.raises(UserError, match="seed_1' is a symbolic link"), prepared(configs):
+        pass
+    assert contents(mine) == before
 
 
 @pytest.mark.parametrize("name", ["metrics.jsonl", "eval_gymnasium.json", "checkpoints", "checkpoints/best"])

@@ -4,6 +4,7 @@ import os
 
 import pytest
 
+from mjx_walk.utils import files
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import open_to_append, replacing, write_text
 
@@ -73,6 +74,30 @@ def test_what_is_not_a_regular_file_is_never_replaced(tmp_path):
         with pytest.raises(UserError, match="it is not a regular file; choose another path"):
             write_text(type(tmp_path)(path), "x")
     assert (tmp_path / "pipe").is_fifo()
+
+
+@pytest.mark.parametrize("open_it", [files.open_to_append, files.open_to_read])
+def test_a_pipe_or_a_folder_is_refused_at_once(tmp_path, open_it):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    for name, says in (("pipe", "not a regular file|No such device"), ("folder", "Is a directory")):
+        with pytest.raises(OSError, match=f"{says}.*{name}"):
+            open_it(tmp_path / name)
+
+
+def test_no_more_is_read_than_a_file_may_hold(tmp_path):
+    (tmp_path / "x").write_bytes(b"12345")
+    assert files.read_bytes(tmp_path / "x", 5) == b"12345"
+    with pytest.raises(ValueError, match="it is larger than 4 bytes"):
+        files.read_bytes(tmp_path / "x", 4)
+
+
+def test_a_link_below_a_folder_is_refused_and_one_above_is_not(tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "link").symlink_to("data")
+    files.refuse_links(tmp_path / "link" / "a" / "b", tmp_path / "link")
+    with pytest.raises(UserError, match="link' is a symbolic link"):
+        files.refuse_links(tmp_path / "link" / "a" / "b", tmp_path)
 
 
 def test_appending_refuses_a_symbolic_link(tmp_path):

@@ -102,3 +102,15 @@ def test_a_number_that_no_array_can_hold_is_refused(seed):
     with pytest.raises(UserError, match="must be at most 1000000000000"):
         validate(Config(seed=seed))
     validate(Config(seed=10**12))
+
+
+def test_a_list_of_very_many_values_is_refused():
+    """A network of as many layers would take hours to compile."""
+
+    @dataclasses.dataclass
+    class Network:
+        sizes: tuple[int, ...] = setting((1,), at_least=1)
+
+    validate(Network((1,) * 100))
+    with pytest.raises(UserError, match="sizes has 101 values; give at most 100"):
+        validate(Network((1,) * 101))

@@ -10,6 +10,9 @@ from pathlib import Path
 import pytest
 from helpers import CLONE
 
+from mjx_walk.utils.devices import count_devices
+from mjx_walk.viewing import rendering
+
 START = (
     f"import sys; sys.path.insert(0, {str(CLONE)!r})\n"
     "from mjx_walk.utils.subprocesses import start_module\n"
@@ -17,15 +20,28 @@ START = (
 )
 
 
-@pytest.mark.parametrize("safe", [True, False])
-def test_a_child_of_a_safe_parent_imports_nothing_from_the_working_directory(tmp_path, safe):
+@pytest.mark.parametrize("parent", ["-P", "a script elsewhere", "-c"])
+def test_a_child_imports_from_the_working_directory_only_what_its_parent_would(tmp_path, parent):
     (tmp_path / "numpy.py").write_text("import pathlib\npathlib.Path('ran').touch()\n")
     env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    # The parent imports nothing from there in either case.
-    program = f"{START if safe else START.replace('import sys;', 'import sys; sys.path.remove(str());')}"
-    arguments = [sys.executable, *(["-P"] if safe else []), "-c", program]
-    subprocess.run(arguments, cwd=tmp_path, env=env, stderr=subprocess.DEVNULL, check=False)
-    assert (tmp_path / "ran").exists() != safe
+    (tmp_path / "elsewhere").mkdir()
+    script = tmp_path / "elsewhere" / "script.py"  # as an installed command, which lies in another folder
+    script.write_text(START)
+    # The parent itself has imported NumPy from its usual place.
+    program = START.replace("import sys;", "import sys; sys.path.remove(''); import numpy; sys.path.insert(0, '');")
+    arguments = {"-P": ["-P", "-c", START], "a script elsewhere": [str(script)], "-c": ["-c", program]}[parent]
+    subprocess.run([sys.executable, *arguments], cwd=tmp_path, env=env, stderr=subprocess.DEVNULL, check=False)
+    assert (tmp_path / "ran").exists() == (parent == "-c")
+
+
+@pytest.mark.parametrize("ask", [count_devices, lambda: rendering._works.__wrapped__("egl")])
+def test_a_question_to_a_child_runs_nothing_of_the_working_directory(tmp_path, monkeypatch, ask):
+    for name in ("jax", "mujoco"):
+        (tmp_path / f"{name}.py").write_text("import pathlib\npathlib.Path('ran').touch()\nprint(False, 1)\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    ask()
+    assert not (tmp_path / "ran").exists()
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells a process that its parent has ended")
