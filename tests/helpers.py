@@ -16,7 +16,7 @@ import orbax.checkpoint as ocp
 import pytest
 
 from mjx_walk.algos import ALGORITHMS
-from mjx_walk.algos.on_policy import OnPolicyConfig
+from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.envs import registry
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.facts import read_facts, write_facts

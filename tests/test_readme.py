@@ -15,7 +15,7 @@ from helpers import CLONE, ENVIRONMENT, PAGES, TINY, TINY_OFF_POLICY, blocks, co
 
 import mjx_walk
 from mjx_walk import zoo
-from mjx_walk.algos.on_policy import OnPolicyConfig
+from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.envs import make_env
 from mjx_walk.runs.config import load_config
 

@@ -10,8 +10,8 @@ from mjx_walk.algos.a2c import A2C, A2CConfig
 from mjx_walk.algos.base import Algorithm, TrainState, is_finite, learned_leaves, without_replay
 from mjx_walk.algos.csac import CSAC, CSACConfig
 from mjx_walk.algos.ddpg import DDPG, DDPGConfig
-from mjx_walk.algos.off_policy import OffPolicyConfig
-from mjx_walk.algos.on_policy import OnPolicyConfig
+from mjx_walk.algos.off_policy_config import OffPolicyConfig
+from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.algos.ppo import PPO, PPOConfig
 from mjx_walk.algos.reinforce import REINFORCE, REINFORCEConfig
 from mjx_walk.algos.sac import SAC, SACConfig

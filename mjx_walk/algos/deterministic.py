@@ -10,7 +10,8 @@ import optax
 from brax.training import types as brax_types
 from brax.training.networks import FeedForwardNetwork
 
-from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm, OffPolicyConfig
+from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm
+from mjx_walk.algos.off_policy_config import OffPolicyConfig
 from mjx_walk.common import networks
 from mjx_walk.common.optimizers import polyak_update
 from mjx_walk.utils.settings import AnyBut, setting

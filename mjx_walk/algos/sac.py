@@ -10,7 +10,8 @@ import optax
 from brax.training import types as brax_types
 from brax.training.agents.sac.networks import SACNetworks
 
-from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm, OffPolicyConfig
+from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm
+from mjx_walk.algos.off_policy_config import OffPolicyConfig
 from mjx_walk.common import networks
 from mjx_walk.common.brax_losses import SACLosses, make_sac_losses
 from mjx_walk.common.optimizers import polyak_update

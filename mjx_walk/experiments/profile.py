@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from gymnasium.utils.performance import benchmark_step
 
 from mjx_walk.algos import Algorithm, TrainState, make_algorithm
-from mjx_walk.algos.off_policy import OffPolicyConfig
+from mjx_walk.algos.off_policy_config import OffPolicyConfig
 from mjx_walk.common.replay_buffer import ReplayBuffer, Steps
 from mjx_walk.envs import Task
 from mjx_walk.envs.physics import make_engine

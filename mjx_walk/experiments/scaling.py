@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mjx_walk.algos import make_algorithm
-from mjx_walk.algos.off_policy import OffPolicyConfig
+from mjx_walk.algos.off_policy_config import OffPolicyConfig
 from mjx_walk.experiments.program_costs import reduced_bytes
 from mjx_walk.experiments.recorded_time import read_device_time
 from mjx_walk.experiments.timing import Measurement, training

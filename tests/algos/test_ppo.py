@@ -13,7 +13,8 @@ from brax.training.agents.ppo.losses import PPONetworkParams
 from helpers import values
 from toy_tasks import BraxSizes, ConstantReward, EndlessReward
 
-from mjx_walk.algos.on_policy import OnPolicyConfig, _make_optimizer
+from mjx_walk.algos.on_policy import _make_optimizer
+from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.algos.ppo import PPO, PPOConfig
 from mjx_walk.common import networks, returns
 from mjx_walk.envs import make_env

@@ -12,7 +12,7 @@ from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command, finish, saved_lea
 from toy_tasks import ObservedReward
 
 from mjx_walk.algos import make_algorithm
-from mjx_walk.algos.off_policy import OffPolicyConfig
+from mjx_walk.algos.off_policy_config import OffPolicyConfig
 from mjx_walk.algos.ppo import PPO, PPOConfig
 from mjx_walk.common import networks, returns
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
