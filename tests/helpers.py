@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 import os
 import re
 import runpy
@@ -19,7 +20,9 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.envs import registry
 from mjx_walk.runs import checkpoint
+from mjx_walk.runs.config import load_config
 from mjx_walk.runs.facts import read_facts, write_facts
+from mjx_walk.runs.saved_config import save_config
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing import rendering
 
@@ -248,3 +251,18 @@ def fenced(text, language):
 def values(metrics):
     """The numbers of metrics, by their names."""
     return {name: metric.value for name, metric in metrics.items()}
+
+
+def fake_run(folder, overrides, returns, score=None):
+    """A run folder whose return rises along `returns`, one row a million steps and ten seconds."""
+    folder.mkdir(parents=True)
+    config = load_config([*overrides, f"run_dir='{folder}'"])
+    save_config(config, folder / "config.yaml")
+    rows = [
+        {"env_steps": 1e6 * i, "wall_seconds": 10.0 * i, "episode/return": value, "episode/length": 10 * value}
+        for i, value in enumerate(returns, start=1)
+    ]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    if score is not None:
+        blocks = {"final": {"mean": score, "std": 1.0}, "best": {"mean": score + 10.0, "std": 2.0}}
+        (folder / "eval_gymnasium.json").write_text(json.dumps({"env": "Walker2d-v5", **blocks}))

@@ -1,42 +1,21 @@
 """Comparing: what is planned, what is kept, what is drawn."""
 
-import csv
 import json
 import re
 import signal
 import subprocess
 
-import numpy as np
 import pytest
-from helpers import TINY, TINY_CALL, command, command_here, finish, start, wait_for_rows
+from helpers import TINY, TINY_CALL, command, command_here, fake_run, finish, start, wait_for_rows
 
 from mjx_walk import compare as compare_command
-from mjx_walk.envs import TASKS, make_options
-from mjx_walk.experiments import logged_runs, planned_runs, suite
-from mjx_walk.runs.config import load_config
-from mjx_walk.runs.saved_config import save_config
+from mjx_walk.experiments import planned_runs, suite
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.text import format_score
 
 SMALL = (
     *("env=walker2d", "num_envs=8", "algo.unroll_length=8", "algo.num_minibatches=2"),
     *("total_steps=512", "evaluation.num_envs=2", "evaluation.gymnasium_episodes=1", "iterations_per_call=1"),
 )
-
-
-def fake_run(folder, overrides, returns, score=None):
-    """A run folder whose return rises along `returns`, one row a million steps and ten seconds."""
-    folder.mkdir(parents=True)
-    config = load_config([*overrides, f"run_dir='{folder}'"])
-    save_config(config, folder / "config.yaml")
-    rows = [
-        {"env_steps": 1e6 * i, "wall_seconds": 10.0 * i, "episode/return": value, "episode/length": 10 * value}
-        for i, value in enumerate(returns, start=1)
-    ]
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    if score is not None:
-        blocks = {"final": {"mean": score, "std": 1.0}, "best": {"mean": score + 10.0, "std": 2.0}}
-        (folder / "eval_gymnasium.json").write_text(json.dumps({"env": "Walker2d-v5", **blocks}))
 
 
 def test_variants_are_the_product_of_algorithms_swept_values_and_seeds(tmp_path):
@@ -79,107 +58,12 @@ def test_the_folder_is_named_after_the_environment_that_is_trained(tmp_path):
     assert str(out) == "runs/compare_walker2d"
 
 
-def test_runs_are_grouped_by_what_sets_them_apart(tmp_path):
-    for seed, score in ((0, 10.0), (1, 20.0)):
-        fake_run(tmp_path / f"x{seed}", ["env=walker2d", f"seed={seed}"], [1, 2, 3], score)
-        fake_run(tmp_path / "sweep" / str(seed), ["env=walker2d", f"seed={seed}", "algo.discount=0.5"], [0, 1])
-    fake_run(tmp_path / "other", ["env=walker2d", "algo=a2c"], [5])
-    fake_run(tmp_path / "engine", ["env=walker2d", "algo=a2c", "physics=jax"], [5])
-    groups = logged_runs.group(logged_runs.read_runs(tmp_path))
-    assert {label: len(runs) for label, runs in groups.items()} == {
-        "a2c, physics=auto": 1,
-        "a2c, physics=jax": 1,
-        "ppo, discount=0.99": 2,
-        "ppo, discount=0.5": 2,
-    }
-    text = suite.write_report(tmp_path).read_text()
-    assert "| ppo, discount=0.99 | final | 15.0 | 7.07 | – | – | – | 2 | 2 | 3.00 | 30 |" in text
-    assert "| ppo, discount=0.99 | best | 25.0 | 7.07 | – | – | – | 2 | 2 | 3.00 | 30 |" in text
-    assert "| ppo, discount=0.5 | final | – | – | – | – | – | 0 | 2 | 2.00 | 20 |" in text
-    assert "| ppo, discount=0.99 | 1 | 20.0 | 1.00 | 30.0 | 2.00 | 3.00 | 30 | 1 |" in text
-    rows = list(csv.DictReader((tmp_path / "comparison.csv").open()))
-    assert len(rows) == 6 and {row["final_mean"] for row in rows} == {"10.0", "20.0", ""}
-    assert {row["best_mean"] for row in rows} == {"20.0", "30.0", ""}
-    assert (tmp_path / "comparison.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_scores_that_cannot_be_read_cost_the_comparison_nothing_else(tmp_path):
-    for seed in (0, 1):
-        fake_run(tmp_path / str(seed), ["env=walker2d", f"seed={seed}"], [1, 2], score=5.0)
-    for damaged in ('{"mean": 5', "[]", '{"final": 3}', "{}"):
-        (tmp_path / "0" / "eval_gymnasium.json").write_text(damaged)
-        with pytest.warns(UserWarning, match=r"eval_gymnasium\.json cannot be read: score the run again"):
-            runs = logged_runs.read_runs(tmp_path)
-        assert [run.score("final").get("mean") for run in runs] == [None, 5.0]
-
-
-def test_a_score_file_of_one_block_counts_as_the_best(tmp_path):
-    fake_run(tmp_path / "0", ["env=walker2d"], [1, 2])
-    content = {"env": "Walker2d-v5", "mean": 7.0, "std": 1.0, "returns": [7.0], "lengths": [3], "seeds": [0]}
-    (tmp_path / "0" / "eval_gymnasium.json").write_text(json.dumps(content | {"env_steps": 5, "wall_seconds": 2.0}))
-    (run,) = logged_runs.read_runs(tmp_path)
-    assert run.score("final") == {} and run.score("best")["mean"] == 7.0
-    assert run.scores.blocks["better"]["env_steps"] == 5 and run.scores.facts == {"wall_seconds": 2.0}
-
-
-def test_runs_of_several_environments_are_normalized(tmp_path):
-    """0 is the random score and 1 the reference, in each environment that Gymnasium scores by default."""
-    for env in ("walker2d", "hopper", "ant", "reacher"):
-        random, reference = suite.REFERENCES[TASKS[env][0].id_of(make_options(env))]
-        for seed in range(3):
-            score = random + (seed + 1) * (reference - random)
-            fake_run(tmp_path / env / str(seed), [f"env={env}", f"seed={seed}"], [1, 2], score)
-    fake_run(tmp_path / "ant" / "3", ["env=ant", "seed=3"], [1, 2], 5000.0)  # not scored in the others
-    text = suite.write_report(tmp_path).read_text()
-    assert "| ppo | final | 2.00 | -0.48 | 4.48 | 2.00 | -0.48 | 4.48 | 4 | 3 |" in text
-    assert "| Reacher-v5 | ppo | 32.8 | 37.9 | -61.2 | 126.9 | 42.8 | -42.9 | -5.03 | 2.00 |" in text
-    assert "| Ant-v5 | ppo | 3 | 5,000 | 1.00 | 5,010 |" in text
-    assert (tmp_path / "comparison.png").read_bytes()[:4] == b"\x89PNG"
-    assert len((tmp_path / "comparison.csv").read_text().splitlines()) == 1 + 13
-
-
-def test_only_gymnasiums_own_environment_has_a_reference(tmp_path):
-    fake_run(tmp_path / "a", ["env=ant", "env.healthy_reward=2"], [1], 100.0)
-    fake_run(tmp_path / "b", ["env=hopper", "env.version=v4"], [1], 100.0)
-    text = suite.write_report(tmp_path).read_text()
-    assert "| ppo | final | – | – | – | – | – | – | 0 | 0 |" in text
-
-
 def test_a_suite_has_every_environment_with_its_own_recipe(tmp_path):
     out, planned = suite.plan_suite("mujoco", [], ["ppo"], [3], str(tmp_path), "cpu")
     assert out == tmp_path and len({run.config.env.name for run in planned}) == 11 == len(planned)
     assert planned[1].name == "humanoid_standup/ppo/seed_3" and planned[1].folder.path == tmp_path / planned[1].name
     with pytest.raises(UserError, match="suite=mujoco has its own environments; leave out one of the two"):
         suite.plan_suite("mujoco", ["env=ant"], ["ppo"], [0], None, "cpu")
-
-
-def test_scores_keep_three_digits():
-    assert [format_score(x) for x in (13_310.4, 143.66, -30.3, -3.94, 0.0, None)] == [
-        "13,310",
-        "143.7",
-        "-30.3",
-        "-3.94",
-        "0.00",
-        "–",
-    ]
-
-
-def test_mean_curve_is_drawn_where_all_seeds_are():
-    x, mean, values = logged_runs.mean_curve(
-        [(np.array([0.0, 4.0]), np.array([0.0, 8.0])), (np.array([2.0, 6.0]), np.array([1.0, 1.0]))]
-    )
-    assert (x[0], x[-1]) == (2.0, 4.0) and values.shape == (2, len(x))
-    np.testing.assert_allclose(mean, (2.0 * x + 1.0) / 2.0)
-    apart = logged_runs.mean_curve([(np.array([0.0, 1.0]), np.ones(2)), (np.array([2.0, 3.0]), np.ones(2))])
-    assert apart[0].size == 0
-
-
-def test_intervals_from_three_seeds_up_cover_the_mean():
-    assert logged_runs.interval(np.arange(2.0)) is None
-    for num_seeds in (3, 5, 10):
-        low, high = logged_runs.interval(np.random.default_rng(0).normal(10.0, 2.0, (num_seeds, 20_000)))
-        assert low.shape == (20_000,)
-        assert ((low < 10.0) & (high > 10.0)).mean() == pytest.approx(0.95, abs=0.005)
 
 
 @pytest.mark.slow
