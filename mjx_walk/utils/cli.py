@@ -27,7 +27,7 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import check_replaceable
 from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.settings import validate
-from mjx_walk.utils.signals import Stopped, exit_code
+from mjx_walk.utils.signals import Stopped, exit_code, ignore_at_exit
 from mjx_walk.utils.subprocesses import end_with_parent
 from mjx_walk.utils.text import printable
 from mjx_walk.utils.value_types import plain_type, type_mistake, with_whole_number
@@ -235,7 +235,9 @@ def main(command: Callable[[list[str]], int | None]) -> NoReturn:
     with console(), standard_settings():
         exempt_imports_from_gc()
         prepare_jax()
-        sys.exit(_exit_code_of(command))
+        code = _exit_code_of(command)
+        ignore_at_exit()
+        sys.exit(code)
 
 
 def _exit_code_of(command: Callable[[list[str]], int | None]) -> int:

@@ -77,6 +77,12 @@ def _in_one_line(
     return _usual_format(message, category, filename, lineno, line)
 
 
+def _say_nothing_of_interrupts(unraisable: Any) -> None:
+    """Hide a Ctrl-C that meets code which cannot raise, such as a callback of the garbage collector."""
+    if not (unraisable.exc_type and issubclass(unraisable.exc_type, KeyboardInterrupt)):
+        sys.__unraisablehook__(unraisable)
+
+
 @contextlib.contextmanager
 def console() -> Iterator[None]:
     """Show this package's log messages, format warnings in one line, and outlive the reader of the output."""
@@ -89,6 +95,7 @@ def console() -> Iterator[None]:
     logger.setLevel(logging.INFO)
     logger.propagate = False  # other libraries may have added handlers to the root logger
     warnings.formatwarning = _in_one_line
+    unraisable_hook, sys.unraisablehook = sys.unraisablehook, _say_nothing_of_interrupts
     try:
         yield
     finally:
@@ -99,3 +106,4 @@ def console() -> Iterator[None]:
         logger.setLevel(level)
         logger.propagate = propagate
         warnings.formatwarning = format_warning
+        sys.unraisablehook = unraisable_hook

@@ -1,12 +1,13 @@
 """Signal handling: a run stops after its current call, and later stages stop as after Ctrl-C."""
 
+import atexit
 import contextlib
 import logging
 import signal
 import threading
 from collections.abc import Callable, Iterator
 
-__all__ = ["Interrupt", "Stopped", "as_by_ctrl_c", "exit_code", "postponed"]
+__all__ = ["Interrupt", "Stopped", "as_by_ctrl_c", "exit_code", "ignore_at_exit", "postponed"]
 
 _PROGRESS = logging.getLogger("mjx_walk.progress")
 _NAMES = ("SIGTERM", "SIGUSR1", "SIGHUP")
@@ -95,6 +96,17 @@ def _handled_by(handler: Callable, *numbers: signal.Signals) -> Iterator[None]:
 def _is_ignored_hangup(number: signal.Signals) -> bool:
     """Whether `nohup` has asked to outlive the terminal."""
     return number.name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN
+
+
+def ignore_at_exit() -> None:
+    """Ignore signals once this process exits: all is done then, and Python would print where it was stopped."""
+    atexit.unregister(_ignore)
+    atexit.register(_ignore)  # what is registered last runs first
+
+
+def _ignore() -> None:
+    for number in (signal.SIGINT, *_FROM_OUTSIDE):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def exit_code(signal_name: str) -> int:

@@ -1,9 +1,13 @@
 """What signals do: the first asks, the second Ctrl-C insists, and neither interrupts what must be finished."""
 
 import signal
+import subprocess
+import sys
 
 import pytest
+from helpers import CLONE
 
+from mjx_walk.utils.console import console
 from mjx_walk.utils.signals import Interrupt, Stopped, as_by_ctrl_c, exit_code, postponed
 
 
@@ -59,3 +63,28 @@ def test_signals_wait_for_what_must_be_finished():
     with pytest.raises(Stopped, match="SIGTERM"):
         finish()
     assert finished
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_process_that_exits_ends_in_peace(name):
+    """Others clean up at exit, which may take seconds."""
+    program = (
+        "import atexit, time; from mjx_walk.utils.signals import ignore_at_exit; "
+        "atexit.register(lambda: (print('exiting', flush=True), time.sleep(0.5))); ignore_at_exit()"
+    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", program], cwd=CLONE, text=True, **pipes) as process:
+        assert process.stdout.readline() == "exiting\n"
+        process.send_signal(getattr(signal, name))
+        assert (process.wait(), process.stderr.read()) == (0, "")
+
+
+@pytest.mark.parametrize(("error", "is_shown"), [(KeyboardInterrupt("three"), False), (ValueError("three"), True)])
+def test_only_ctrl_c_is_hidden_where_code_cannot_raise(capsys, error, is_shown):
+    class Raises:
+        def __del__(self):
+            raise error
+
+    with console():
+        Raises()
+    assert ("three" in capsys.readouterr().err) == is_shown
