@@ -25,7 +25,7 @@ from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.saved_config import differences, in_short, read_saved_config
 from mjx_walk.utils.devices import only_device
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import open_to_append, refuse_links, user_path
+from mjx_walk.utils.files import check_replaceable, open_to_append, refuse_links, user_path
 from mjx_walk.utils.locks import locked
 from mjx_walk.utils.signals import Interrupt
 from mjx_walk.utils.subprocesses import start_module
@@ -238,6 +238,7 @@ def run_jobs(
                     job, device = waiting.pop(0), free.pop(0)
                     log = logs / _log_name(job)
                     refuse_links(log, logs.parent)
+                    check_replaceable(log)
                     running[start_job(job, log, device, share, lock)] = (job, log, device)
                 time.sleep(0.5)
                 for process in [process for process in running if process.poll() is not None]:

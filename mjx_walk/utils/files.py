@@ -191,7 +191,12 @@ def open_to_append(path: Path) -> int:
 
 def _open_regular(path: str | Path, flags: int) -> int:
     """Open a regular file. Without `O_NONBLOCK`, opening a pipe would wait for its other end."""
-    descriptor = os.open(path, flags | os.O_NONBLOCK, 0o666)
+    try:
+        descriptor = os.open(path, flags | os.O_NONBLOCK, 0o666)
+    except OSError as error:
+        if error.errno != errno.ENXIO:
+            raise
+        raise OSError(errno.EINVAL, "not a regular file", str(path)) from error  # a pipe that nobody reads, or a socket
     mode = os.fstat(descriptor).st_mode
     if stat.S_ISREG(mode):
         return descriptor

@@ -1,6 +1,7 @@
 """Comparing: what is planned, what is kept, what is drawn."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -212,6 +213,14 @@ def test_a_link_in_the_folder_of_a_comparison_is_refused(tmp_path, link, capsys)
     assert command_here("compare", *arguments) == 2
     assert f"{link}' is a symbolic link" in capsys.readouterr().err
     assert list((tmp_path / "outside").iterdir()) == []
+
+
+def test_a_pipe_in_place_of_a_log_is_refused(tmp_path, capsys):
+    (tmp_path / "logs" / "ppo").mkdir(parents=True)
+    os.mkfifo(tmp_path / "logs" / "ppo" / "seed_0.txt")
+    arguments = [*TINY, "algos=[ppo]", "seeds=1", f"total_steps={TINY_CALL}", f"out={tmp_path}"]
+    assert command_here("compare", *arguments) == 2
+    assert "seed_0.txt: it is not a regular file" in capsys.readouterr().err
 
 
 def test_a_run_that_fails_is_named(tmp_path, monkeypatch, capfd):

@@ -80,7 +80,7 @@ def test_what_is_not_a_regular_file_is_never_replaced(tmp_path):
 def test_a_pipe_or_a_folder_is_refused_at_once(tmp_path, open_it):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
-    for name, says in (("pipe", "not a regular file|No such device"), ("folder", "Is a directory")):
+    for name, says in (("pipe", "not a regular file"), ("folder", "Is a directory")):
         with pytest.raises(OSError, match=f"{says}.*{name}"):
             open_it(tmp_path / name)
 
