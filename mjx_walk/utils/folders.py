@@ -1,6 +1,7 @@
 """Folders that are written completely or not at all, and found again if a crash came between two renames."""
 
 import contextlib
+import errno
 import os
 import shutil
 from collections.abc import Collection, Iterator
@@ -19,12 +20,18 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     """Context manager for writing a folder under a fresh name. On success it replaces `path`, else it is removed.
 
     All its files are on the disk before the name is. The folder above `path` is created, but none above that.
+
+    Raises:
+        FileNotFoundError: a folder above `path` was moved or removed in the meantime.
     """
     path.parent.mkdir(exist_ok=True)
     unfinished, former = _hidden_name(path), _hidden_name(path)
     unfinished.mkdir()
+    places = {folder: _identity(folder) for folder in (unfinished, *path.parents)}
     try:
         yield unfinished
+        if _identity(unfinished) != places[unfinished]:  # TensorStore makes missing folders anew
+            raise FileNotFoundError(errno.ENOENT, "a folder above was moved or removed", str(path))
         sync_tree(unfinished)
         if path.exists():
             os.replace(path, former)  # atomic, unlike removing a folder
@@ -38,6 +45,19 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         if path.exists():
             _remove(former)
         _remove(unfinished)
+        for folder in path.parents:
+            if _identity(folder) not in (places[folder], None):  # made anew, too
+                with contextlib.suppress(OSError):
+                    folder.rmdir()  # if it is empty
+
+
+def _identity(folder: Path) -> tuple[int, int] | None:
+    """What stays the same when a folder is moved; None if there is none to be seen."""
+    try:
+        status = folder.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 def find_written(path: Path, last_file: str) -> Path | None:

@@ -109,3 +109,23 @@ def test_no_folder_appears_where_the_one_above_has_vanished(tmp_path):
     with pytest.raises(FileNotFoundError):
         write(tmp_path / "run" / "checkpoints" / "best", "x")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("others_file", [None, "theirs"])
+def test_a_folder_above_that_is_moved_while_its_content_is_written_is_not_made_anew(tmp_path, others_file):
+    """Some writers, such as TensorStore, make all folders that they miss."""
+    run = tmp_path / "runs" / "run"
+    run.mkdir(parents=True)
+
+    def write_while_it_is_moved():
+        with replacing_folder(run / "checkpoints" / "1") as new:
+            (tmp_path / "runs").rename(tmp_path / "moved")
+            new.mkdir(parents=True)
+            (new / "last").touch()
+            if others_file:
+                (run / others_file).touch()
+
+    with pytest.raises(FileNotFoundError, match="a folder above was moved or removed"):
+        write_while_it_is_moved()
+    left = [path.name for path in (tmp_path / "runs").rglob("*")]
+    assert left == (["run", "theirs"] if others_file else []) and (tmp_path / "runs").exists() == bool(others_file)
