@@ -45,9 +45,28 @@ class SubEnv(MujocoAttributes):
         return self._vector_env.single_action_space
 
     @property
-    def np_random_seed(self) -> int | None:
-        seeds = self._vector_env.np_random_seed
-        return seeds[self._index] if seeds else None
+    def np_random_seed(self) -> int:
+        return self._vector_env.np_random_seed[self._index]
+
+    @property
+    def unwrapped(self) -> "SubEnv":
+        """Itself: no wrapper is around one environment."""
+        return self
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        """An attribute, as `gymnasium.Env.get_wrapper_attr` finds it."""
+        return getattr(self, name)
+
+    def has_wrapper_attr(self, name: str) -> bool:
+        """Whether there is an attribute."""
+        return hasattr(self, name)
+
+    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+        """Set an attribute; without `force`, only one that exists. Returns whether it was set."""
+        if force or hasattr(self, name):
+            setattr(self, name, value)
+            return True
+        return False
 
     def _read_state(self) -> State | None:
         return jax.tree.map(lambda x: x[self._index], self._vector_env._state)

@@ -49,15 +49,17 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
             keywords: Gymnasium's, and those of `TaskOptions`.
 
         Raises:
-            UserError: an unknown name, engine or keyword, or `render_mode="human"`.
+            UserError: an unknown name, engine or keyword, or a `render_mode` that is of one environment.
         """
         refuse_fork()
         if type_problem(num_envs, int) or num_envs < 1:
             raise UserError(f"num_envs={num_envs}: must be an integer of at least 1")
         options, self._rendering = split_keywords(keywords)
-        if self._rendering.get("render_mode") == "human":
+        mode = self._rendering.get("render_mode")
+        if mode == "human" or str(mode).endswith("_list"):
+            does = "shows" if mode == "human" else "collects the frames of"
             raise UserError(
-                "render_mode='human' shows one environment: use gymnasium.make or vectorization_mode='sync'"
+                f"render_mode={mode!r} {does} one environment: use gymnasium.make or vectorization_mode='sync'"
             )
         self._options, self._physics = make_options(env, **options), physics
         self.num_envs = num_envs
@@ -83,7 +85,9 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
-        """The seed of each environment; empty before the first reset."""
+        """The seed of each environment, drawn if it is asked for before the first reset, as in Gymnasium."""
+        if self._keys is None:
+            self._seed([None] * self.num_envs, np.ones(self.num_envs, np.bool_))
         return self._seeds
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None):
@@ -97,7 +101,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         refuse_changes(self._twin.model, self._original)
         seeds = self._listed_seeds(seed)
         mask = _checked_mask(options["reset_mask"], self.num_envs) if options and "reset_mask" in options else None
-        if mask is not None and self._state is None:
+        if mask is not None and self._state is None and not mask.all():
             raise gymnasium.error.ResetNeeded("reset all environments before you reset some with reset_mask")
         self._seed(seeds, np.ones(self.num_envs, np.bool_) if mask is None else mask)
         mask, before = (np.ones(self.num_envs, np.bool_), None) if mask is None else (mask, self._state)

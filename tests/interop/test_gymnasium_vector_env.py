@@ -92,8 +92,9 @@ def test_wrong_actions_and_keywords_raise():
     for action in (0.0, np.zeros(2), np.zeros((2, 1)), np.zeros((1, 6)), np.zeros(12)):
         with pytest.raises(ValueError, match="Action dimension mismatch"):
             envs.step(action)
-    with pytest.raises(UserError, match="'human' shows one environment"):
-        gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=2, render_mode="human")
+    for mode, says in (("human", "'human' shows one environment"), ("rgb_array_list", "collects the frames of one")):
+        with pytest.raises(UserError, match=says):
+            gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=2, render_mode=mode)
 
 
 def test_copies_and_attributes():
@@ -149,3 +150,23 @@ def test_workers(context):
     expected, _ = gymnasium.make("Walker2d-v5").reset(seed=3)
     np.testing.assert_allclose(obs[0], expected, atol=1e-6)
     envs.close()
+
+
+def test_what_gymnasiums_own_vector_environment_allows_before_the_first_reset():
+    ours = gymnasium.make_vec("mjx_walk/Hopper-v5", num_envs=3)
+    theirs = gymnasium.make_vec("Hopper-v5", num_envs=3)
+    for envs in (ours, theirs):
+        seeds = envs.np_random_seed
+        assert len(seeds) == 3 and all(isinstance(seed, int) for seed in seeds)
+        obs, _ = envs.reset(options={"reset_mask": np.ones(3, np.bool_)})
+        assert obs.shape == (3, 11)
+    assert ours.np_random_seed == ours.get_attr("np_random_seed")
+
+
+def test_sub_environments_have_the_attributes_of_an_unwrapped_environment():
+    for name in ("mjx_walk/Hopper-v5", "Hopper-v5"):
+        envs = gymnasium.make_vec(name, num_envs=2)
+        assert envs.call("get_wrapper_attr", "dt") == (0.008, 0.008)
+        assert envs.call("has_wrapper_attr", "nothing") == (False, False)
+        assert envs.call("set_wrapper_attr", "note", 7) == (True, True) and envs.get_attr("note") == (7, 7)
+        assert [env.frame_skip for env in envs.get_attr("unwrapped")] == [4, 4]
