@@ -1,9 +1,9 @@
 """`python docs/scaling_figure.py`: draw scaling.png from the rows on several GPUs in experiments.csv."""
 
-import csv
 from pathlib import Path
 
 import matplotlib.figure
+from generator.score_tables import read
 
 DOCS = Path(__file__).parent
 SERIES = {
@@ -18,8 +18,7 @@ GPUS = (1, 2, 4)
 
 def factors() -> dict[str, list[float]]:
     """Speed of each series, in multiples of that on one GPU."""
-    with (DOCS / "experiments.csv").open(newline="", encoding="utf-8") as file:
-        speeds = {row["id"]: float(row["final_mean"]) for row in csv.DictReader(file) if row["measure"] == "speed"}
+    speeds = {row["id"]: float(row["final_mean"]) for row in read("experiments.csv") if row["measure"] == "speed"}
     return {label: [speeds[arm] / speeds[arms[0]] for arm in arms] for label, arms in SERIES.items()}
 
 

@@ -36,41 +36,28 @@ class Entry(NamedTuple):
 
 def joint_positions(model: mujoco.MjModel) -> list[Name]:
     """Names of the elements of `qpos`."""
-    names: list[Name] = []
-    for joint in map(model.joint, range(model.njnt)):
-        if joint.type == mujoco.mjtJoint.mjJNT_FREE:
-            names += [(f"{what} `{joint.name}`", unit) for what, unit in _FREE_POSITION]
-        else:
-            names.append(_joint_name("position", "m", "angle", "rad", joint))
-    return names
+    return _of_joints(model, _FREE_POSITION, ("position of", "m"), ("angle of", "rad"))
 
 
 def joint_velocities(model: mujoco.MjModel) -> list[Name]:
     """Names of the elements of `qvel`."""
-    names: list[Name] = []
-    for joint in map(model.joint, range(model.njnt)):
-        if joint.type == mujoco.mjtJoint.mjJNT_FREE:
-            names += [(f"{what} `{joint.name}`", unit) for what, unit in _FREE_VELOCITY]
-        else:
-            names.append(_joint_name("velocity", "m/s", "angular velocity", "rad/s", joint))
-    return names
+    return _of_joints(model, _FREE_VELOCITY, ("velocity of", "m/s"), ("angular velocity of", "rad/s"))
 
 
 def joint_forces(model: mujoco.MjModel, what: str) -> list[Name]:
     """Names of the elements of an array with a force for each degree of freedom."""
+    force, torque = (f"{what} force on", "N"), (f"{what} torque on", "N·m")
+    return _of_joints(model, [force] * 3 + [torque] * 3, force, torque)
+
+
+def _of_joints(model: mujoco.MjModel, free: list[Name], slide: Name, hinge: Name) -> list[Name]:
+    """Names of the elements that free joints, sliders and hinges have, with the joint's name behind each."""
+    kinds = {mujoco.mjtJoint.mjJNT_FREE: free, mujoco.mjtJoint.mjJNT_SLIDE: [slide]}
     names: list[Name] = []
     for joint in map(model.joint, range(model.njnt)):
-        if joint.type == mujoco.mjtJoint.mjJNT_FREE:
-            names += [(f"{what} force on `{joint.name}`", "N")] * 3 + [(f"{what} torque on `{joint.name}`", "N·m")] * 3
-        else:
-            names.append(_joint_name(f"{what} force on", "N", f"{what} torque on", "N·m", joint, of=""))
+        elements = kinds.get(mujoco.mjtJoint(joint.type[0]), [hinge])
+        names += [(f"{what} `{joint.name}`", unit) for what, unit in elements]
     return names
-
-
-def _joint_name(slide: str, slide_unit: str, hinge: str, hinge_unit: str, joint, of: str = " of") -> Name:
-    is_slide = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
-    what, unit = (slide, slide_unit) if is_slide else (hinge, hinge_unit)
-    return f"{what}{of} `{joint.name}`", unit
 
 
 def observed(task: Task, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:

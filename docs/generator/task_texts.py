@@ -15,6 +15,10 @@ _NORMAL = (
 _NO_TERMINATION = "Never. Episodes end at the time limit."
 _BY_BODY = "Rows of a body are MuJoCo's `cinert`, `cvel` and `cfrc_ext`, in a frame at the center of mass."
 _PAID_AT_THE_END = "v4 also pays `{term}` in the step that terminates the episode."
+_ALWAYS_ZERO = (
+    "v4 also observes the world body in `cinert`, `cvel` and `cfrc_ext`, and the root joint in `qfrc_actuator`. These "
+    "numbers are always zero."
+)
 
 
 class TaskText(NamedTuple):
@@ -52,8 +56,7 @@ TEXTS = {
         v4=(
             _PAID_AT_THE_END.format(term="reward_alive"),
             "v4 has no contact cost.",
-            "v4 also observes the world body in `cinert`, `cvel` and `cfrc_ext`, and the root joint in "
-            "`qfrc_actuator`. These numbers are always zero.",
+            _ALWAYS_ZERO,
         ),
     ),
     "humanoid_standup": TaskText(
@@ -67,10 +70,7 @@ TEXTS = {
         },
         termination=_NO_TERMINATION,
         observation=_BY_BODY,
-        v4=(
-            "v4 also observes the world body in `cinert`, `cvel` and `cfrc_ext`, and the root joint in "
-            "`qfrc_actuator`. These numbers are always zero.",
-        ),
+        v4=(_ALWAYS_ZERO,),
     ),
     "walker2d": TaskText(
         goal="A two-legged walker runs forward in a plane.",

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Shaped
 
-from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.errors import UserError, first_line
 
 __all__ = ["refuse_unsupported", "unsupported_by_mjx", "warn_of_approximations"]
 
@@ -62,7 +62,7 @@ def unsupported_by_mjx(engine: str, error: Exception) -> UserError:
         engine: name of the engine.
         error: MJX's own error.
     """
-    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    reason = first_line(error)
     return UserError(f"physics={engine}: MJX does not support this model: {reason}; use physics=c")
 
 

@@ -56,7 +56,7 @@ def make_twin(options: TaskOptions, rendering: dict[str, Any]) -> MujocoEnv:
     has_screen = sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
     if rendering.get("render_mode") == "human" and not has_screen:
         raise UserError("render_mode='human' needs a screen; use render_mode='rgb_array'")
-    spec = gymnasium.spec(f"{TASKS[options.name][0].GYMNASIUM_NAME}-{options.version}")
+    spec = gymnasium.spec(TASKS[options.name][0].id_of(options))
     create: Any = load_env_creator(str(spec.entry_point))
     with hide_deprecations():
         return create(**spec.kwargs | options.gymnasium_kwargs() | rendering)

@@ -9,10 +9,11 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.runs.recipes import fitting_recipes, recipe_names
 from mjx_walk.runs.schema import chosen, setting_types
+from mjx_walk.utils.errors import first_line
 from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.value_types import plain_type, type_mistake
 
-__all__ = ["explain", "first_line", "unknown_key"]
+__all__ = ["explain", "unknown_key"]
 
 _ELSEWHERE = {
     "algorithm": "algo",
@@ -71,11 +72,6 @@ def explain(error: BaseException, overrides: list[str]) -> str:
     if key not in given or "Interpolation" in detail:
         return f"{full_key}: {detail}" if full_key else detail
     return type_mistake(key, given[key], types.get(key)) or f"{key}={given[key]}: {detail}"
-
-
-def first_line(error: BaseException) -> str:
-    """The first line of an error's text that is not empty."""
-    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
 
 
 def unknown_key(key: str, env: str, algo: str) -> str:

@@ -13,12 +13,11 @@ from omegaconf.errors import OmegaConfBaseException
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.runs.config import Config, flatten, to_config
-from mjx_walk.runs.mistakes import first_line
 from mjx_walk.runs.own_tasks import find_saved_task
 from mjx_walk.runs.renamed import under_present_names
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.saved_yaml import read_yaml
-from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.errors import UserError, first_line
 from mjx_walk.utils.files import write_text
 
 __all__ = [

@@ -6,6 +6,8 @@ from typing import Self
 
 import jax
 
+from mjx_walk.utils.errors import first_line
+
 _log = logging.getLogger(__name__)
 
 CALLS_BEFORE = 2
@@ -48,7 +50,7 @@ class CallProfile:
             jax.profiler.start_trace(self._folder, profiler_options=options)
             self._is_recording = True
         except RuntimeError as error:  # the user's own program records already
-            _log.warning(f"cannot record calls: {_first_line(error)}")
+            _log.warning(f"cannot record calls: {first_line(error)}")
 
     def _stop(self) -> None:
         if not self._is_recording:
@@ -59,8 +61,4 @@ class CallProfile:
                 raise OSError("its run folder was removed")  # the profiler would make it anew
             jax.profiler.stop_trace()
         except (OSError, RuntimeError) as error:
-            _log.warning(f"cannot write the recording of calls to {self._folder}: {_first_line(error)}")
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).partition("\n")[0]
+            _log.warning(f"cannot write the recording of calls to {self._folder}: {first_line(error)}")

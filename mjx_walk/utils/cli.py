@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mjx_walk.utils.compat import exempt_imports_from_gc, prepare_jax, standard_settings
 from mjx_walk.utils.console import console
-from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.errors import UserError, first_line
 from mjx_walk.utils.files import check_replaceable
 from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.settings import validate
@@ -80,7 +80,7 @@ def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Argument
             OmegaConf.update(node, key, OmegaConf.from_dotlist([f"value={text}"]).value)
         except (OmegaConfBaseException, yaml.YAMLError) as error:
             mistake = type_mistake(key, value, hints[key])
-            raise UserError(mistake or f"{argument}: {str(error).splitlines()[0]}") from error
+            raise UserError(mistake or f"{argument}: {first_line(error)}") from error
     parsed: Any = dataclasses.replace(OmegaConf.to_object(node), **texts)  # type: ignore[type-var]
     validate(parsed)
     return parsed

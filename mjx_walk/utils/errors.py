@@ -35,3 +35,8 @@ def failed_read(folder: Path, error: OSError) -> ValueError:
         name = f"{Path(error.filename).name}: " if error.filename else ""
         return ValueError(f"{folder} is damaged: {name}{reason}")
     return UnreadableError(f"cannot read {error.filename or folder}: {reason}; once it can be read, try again")
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error's text that is not empty."""
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
