@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import signal
 import time
 
 import jax
@@ -10,7 +11,7 @@ import pytest
 from helpers import TINY_OFF_POLICY, command, command_here
 
 from mjx_walk.bench import device_counts
-from mjx_walk.experiments import scaling
+from mjx_walk.experiments import scaling, timing
 from mjx_walk.experiments.program_costs import matmul_flops, reduced_bytes
 from mjx_walk.experiments.recorded_time import read_device_time
 from mjx_walk.experiments.scaling import share_of_total
@@ -18,6 +19,7 @@ from mjx_walk.runs.config import load_config
 from mjx_walk.training.call_profile import CallProfile
 from mjx_walk.utils import collectives
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.subprocesses import start_module
 
 
 @pytest.mark.slow
@@ -79,6 +81,32 @@ def test_a_speed_is_that_after_everything_is_compiled(monkeypatch):
     for seconds in (1, 8):
         speed = scaling.measure_speed(["env=humanoid"], 2, seconds)
         assert speed == (50.0, 2.0)
+
+
+@pytest.mark.slow
+def test_a_training_that_hangs_is_ended(monkeypatch):
+    """After its first row the training stands still and ignores SIGTERM, as one that blocks within CUDA does."""
+    stopped = []
+
+    def start_and_stop(*arguments, **options):
+        process = start_module(*arguments, **options)
+        stopped.append(process)
+        return process
+
+    def stop_at_the_first_row(rows):
+        if rows:
+            stopped[0].send_signal(signal.SIGSTOP)
+        return False
+
+    monkeypatch.setattr(timing, "start_module", start_and_stop)
+    monkeypatch.setattr(timing, "_PATIENCE", 2.0)
+    settings = ["algo=td3", *TINY_OFF_POLICY, "total_steps=1000000"]
+    with (
+        pytest.raises(RuntimeError, match=r"steps(.|\n)*no row for [0-9]+ s"),
+        timing.training(settings, stop_at_the_first_row, signal.SIGTERM),
+    ):
+        pass
+    assert stopped[0].returncode == -signal.SIGKILL
 
 
 def test_several_devices_share_what_one_has():

@@ -21,7 +21,6 @@ from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
 
 _MIN_CALLS = 3
-_RECORDED_CALLS = 2
 _ENDLESS = 10**12
 
 
@@ -36,6 +35,8 @@ class Speed(NamedTuple):
 def measure(overrides: list[str], config: Config, sizes: list[int], seconds: float) -> Iterator[Measurement]:
     """Measure each number of GPUs, first with the recipe's environments on each, then with the recipe's in total.
 
+    The speeds come first, and then what the first device does in a call.
+
     Args:
         overrides: as for `train`.
         config: the same, composed.
@@ -47,18 +48,19 @@ def measure(overrides: list[str], config: Config, sizes: list[int], seconds: flo
         RuntimeError: training failed.
     """
     shares = {size: share_of_total(config, size) for size in sizes if size > 1}
-    alone = None
+    variants: list[tuple[str, int, list[str]]] = []
     for size in sizes:
-        variants: list[tuple[int, list[str]]] = [(config.num_envs, [])]
+        variants.append((f"{size} x {config.num_envs} environments", size, overrides))
         if size > 1:
-            variants.append((config.num_envs // size, shares[size]))
-        for num_envs, settings in variants:
-            arguments = [*overrides, *settings]
-            speed = measure_speed(arguments, size, seconds)
-            alone = speed.steps_per_second if size == 1 else alone
-            name = f"{size} x {num_envs} environments"
-            yield from _speeds(name, speed, alone if size > 1 else None)
-            yield from _parts(name, arguments, size)
+            name = f"{size} x {config.num_envs // size} environments"
+            variants.append((name, size, [*overrides, *shares[size]]))
+    alone = None
+    for name, size, arguments in variants:
+        speed = measure_speed(arguments, size, seconds)
+        alone = speed.steps_per_second if size == 1 else alone
+        yield from _speeds(name, speed, alone if size > 1 else None)
+    for name, size, arguments in variants:
+        yield from _parts(name, arguments, size)
     if shares:
         # Only now, because this process would allocate the devices' memory.
         algorithm = make_algorithm(
@@ -119,18 +121,16 @@ def _speeds(name: str, speed: Speed, alone: float | None) -> Iterator[Measuremen
 def _parts(name: str, overrides: list[str], size: int) -> Iterator[Measurement]:
     """What the first device does in a call, from a training of its own: recording changes the speed.
 
-    On GPUs, a process that records may crash (jax 0.11, Warp 1.18). Its parts are then left out.
+    On GPUs, a process that records may crash or hang (jax 0.11, Warp 1.18). Its parts are then left out. Recording a
+    second call hangs on one GPU, so only one is recorded.
     """
-    num_rows = CALLS_BEFORE + _RECORDED_CALLS + 1  # the recording is written before the last of these calls
-    arguments = [*overrides, f"profile_calls={_RECORDED_CALLS}"]
+    num_rows = CALLS_BEFORE + 2  # the recording is written before the last of these calls
     try:
-        with _training(arguments, size, lambda rows: len(rows) >= num_rows) as (_, run_dir):
+        with _training([*overrides, "profile_calls=1"], size, lambda rows: len(rows) >= num_rows) as (_, run_dir):
             recorded = read_device_time(run_dir / "profile")
     except RuntimeError as error:
         warnings.warn(f"{name}: the training that JAX's profiler recorded failed: {str(error)[-200:]}", stacklevel=2)
         return
     for part in ("physics", "reductions"):
-        milliseconds = getattr(recorded, part) / _RECORDED_CALLS * 1e3
-        yield Measurement(f"  {name}: {part} in a recorded call", milliseconds, "ms")
-    share = 100 * recorded.reductions / recorded.total
-    yield Measurement(f"  {name}: share of reductions", share, "%")
+        yield Measurement(f"  {name}: {part} in a recorded call", getattr(recorded, part) * 1e3, "ms")
+    yield Measurement(f"  {name}: share of reductions", 100 * recorded.reductions / recorded.total, "%")

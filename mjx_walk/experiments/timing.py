@@ -6,13 +6,16 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from subprocess import STDOUT
+from subprocess import STDOUT, Popen, TimeoutExpired
 from typing import NamedTuple
 
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.signals import as_by_ctrl_c
 from mjx_walk.utils.subprocesses import start_module, with_parent
+
+_PATIENCE = 60.0
+"""Least time in seconds after which a training without a new row hangs, and longest time that one may take to end."""
 
 
 class Measurement(NamedTuple):
@@ -63,7 +66,7 @@ def training(
 
     Raises:
         UserError: training rejects these settings.
-        RuntimeError: training failed.
+        RuntimeError: training failed, or hangs: no row came for three times as long as the first one took.
     """
     with as_by_ctrl_c(), tempfile.TemporaryDirectory() as folder:
         run_dir, output = Path(folder, "run"), Path(folder, "output.txt")
@@ -72,15 +75,43 @@ def training(
             output.open("w") as file,
             start_module("train", *arguments, env=with_parent() | (env or {}), stdout=file, stderr=STDOUT) as process,
         ):
+            hangs = False
             try:
-                # The process outlives its last row for a while, so this loop reads that row.
-                while not are_enough(rows := read_rows(run_dir / "metrics.jsonl")) and process.poll() is None:
-                    time.sleep(0.1)
+                rows, hangs = _wait_for_rows(run_dir / "metrics.jsonl", are_enough, process)
             finally:
-                process.send_signal(last_signal)
+                _end(process, signal.SIGKILL if hangs else last_signal)
         if are_enough(rows):
             yield rows, run_dir
             return
         if process.returncode == 2:
             raise UserError(output.read_text().splitlines()[-1].removeprefix("error: "))
-        raise RuntimeError(f"train {' '.join(arguments)}: {output.read_text()}")
+        end = f"no row for {_limit(rows):.0f} s" if hangs else f"exit code {process.returncode}"
+        raise RuntimeError(f"train {' '.join(arguments)}: {output.read_text()}{end}")
+
+
+def _wait_for_rows(metrics: Path, are_enough: Callable[[list[Row]], bool], process: Popen) -> tuple[list[Row], bool]:
+    """The rows once they are enough or the process has ended or hangs, and whether it hangs."""
+    rows: list[Row] = []
+    last_row_at = time.monotonic()
+    # The process outlives its last row for a while, so this loop reads that row.
+    while not are_enough(logged := read_rows(metrics)) and process.poll() is None:
+        if len(logged) > len(rows):
+            rows, last_row_at = logged, time.monotonic()
+        if rows and time.monotonic() - last_row_at > _limit(rows):
+            return rows, True
+        time.sleep(0.1)
+    return logged, False
+
+
+def _end(process: Popen, last_signal: signal.Signals) -> None:
+    process.send_signal(last_signal)
+    try:
+        with contextlib.suppress(TimeoutExpired):
+            process.wait(_PATIENCE)
+    finally:
+        process.kill()
+
+
+def _limit(rows: list[Row]) -> float:
+    """Longest time in seconds between two rows. Only the first call compiles, so no other takes longer than it."""
+    return max(_PATIENCE, 3 * rows[0]["wall_seconds"])
