@@ -11,6 +11,7 @@ from typing import Any
 import flax
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjx_walk.envs.state import State
 from mjx_walk.envs.task import Task
@@ -32,6 +33,10 @@ class EvaluationConfig:
     """Film an episode in the real Gymnasium after each round, into `films/` and for TensorBoard."""
 
 
+NO_RETURN = float(np.finfo(np.float32).min)
+"""The lowest float32, which is finite, so that `JAX_DEBUG_INFS=1` stops only at faults."""
+
+
 class InlineEvaluation(flax.struct.PyTreeNode):
     """One round of episodes under a snapshot of the policy, and the best snapshot so far."""
 
@@ -50,7 +55,7 @@ class InlineEvaluation(flax.struct.PyTreeNode):
     best_iteration: jax.Array = flax.struct.field(metadata=ITERATION_COUNT)
     """`[] i32`: iterations before the best snapshot was taken."""
     best_return: jax.Array
-    """`[] f32`, -inf before the first round has ended."""
+    """`[] f32`, `NO_RETURN` before the first round has ended."""
 
 
 class InlineEvaluator:
@@ -93,7 +98,7 @@ class InlineEvaluator:
             lengths=jnp.zeros(self.num_envs, jnp.int32),
             best_policy_params=policy_params,
             best_iteration=jnp.zeros((), jnp.int32),
-            best_return=jnp.float32(-jnp.inf),
+            best_return=jnp.float32(NO_RETURN),
         )
 
     def act(self, evaluation: InlineEvaluation) -> jax.Array:

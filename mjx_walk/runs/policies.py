@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import logging
-import math
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 
 from mjx_walk.algos import Algorithm, TrainState, make_algorithm, without_replay
 from mjx_walk.envs import TASKS, Task
+from mjx_walk.envs.inline_evaluation import NO_RETURN
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config
@@ -188,7 +188,7 @@ def best_policy(state: TrainState, steps_per_iteration: int) -> tuple[Any, dict[
         steps_per_iteration: environment steps of an iteration, over all devices.
     """
     evaluation = state.evaluation
-    if math.isinf(evaluation.best_return):
+    if evaluation.best_return <= NO_RETURN:  # -inf in older runs
         return None
     env_steps = int(evaluation.best_iteration) * steps_per_iteration
     return evaluation.best_policy_params, {"env_steps": env_steps, "eval_return": float(evaluation.best_return)}

@@ -13,7 +13,7 @@ from mjx_walk.runs.checkpoint import list_steps, read_meta
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.training.distributed_checkpoint import SEEDS_TOGETHER
 from mjx_walk.training.recorder import Recorder
-from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.errors import UnreadableError, UserError
 
 __all__ = ["have_saved", "restore_together"]
 
@@ -63,6 +63,8 @@ def restore_together(recorders: list[Recorder], like: TrainState) -> list[tuple[
 def _is_saved_together(path: Path, num_seeds: int) -> bool:
     try:
         return read_meta(path).get(SEEDS_TOGETHER) == num_seeds
+    except UnreadableError:
+        raise
     except ValueError:
         return False
 

@@ -61,13 +61,17 @@ def standard_dtypes() -> Iterator[None]:
 
 @contextlib.contextmanager
 def standard_settings() -> Iterator[None]:
-    """`standard_dtypes`, and JAX's usual random numbers. The caller's settings then do not change a run."""
+    """`standard_dtypes`, JAX's usual random numbers, and any transfers between host and device.
+
+    The caller's settings then neither change nor stop a run.
+    """
     with (
         standard_dtypes(),
         jax.default_prng_impl("threefry2x32"),
         jax.enable_custom_prng(False),
         jax.legacy_prng_key("allow"),
         jax.threefry_partitionable(True),
+        jax.transfer_guard("allow"),
     ):
         yield
 
