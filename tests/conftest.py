@@ -6,6 +6,7 @@ does, are in no cache. `_QUICK_COMPILE` cuts compile times. `helpers.OPTIMIZED` 
 """
 
 import atexit
+import gc
 import os
 import random
 import shutil
@@ -32,6 +33,12 @@ if _QUICK_COMPILE not in _FLAGS:  # pytest-xdist's workers inherit the flags
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _temporary_folder()
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+
+
+def pytest_collection_finish():
+    """Spare Python the repeated search of what never becomes garbage: MJX's half million objects, JAX's programs."""
+    gc.freeze()
+    gc.set_threshold(200_000, 20, 100)
 
 
 def pytest_addoption(parser):

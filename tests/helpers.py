@@ -248,6 +248,13 @@ def fenced(text, language):
     return [block for name, block in found if name == language]
 
 
+def slow_except(fast, cases):
+    """The cases for `parametrize`, of which all but the fast ones are slow tests."""
+    cases = list(cases)
+    assert set(fast) <= set(cases)
+    return [case if case in fast else pytest.param(case, marks=pytest.mark.slow) for case in cases]
+
+
 def values(metrics):
     """The numbers of metrics, by their names."""
     return {name: metric.value for name, metric in metrics.items()}

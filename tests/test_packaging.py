@@ -102,6 +102,7 @@ def test_wheel_from_elsewhere(installed, tmp_path):
     assert python_use(tmp_path, [installed]).is_relative_to(installed)
 
 
+@pytest.mark.slow
 def test_wheel_with_the_clone_as_current_folder(installed, clone):
     assert python_use(clone, [installed]).is_relative_to(clone)  # Python takes the current folder first
 
@@ -110,6 +111,7 @@ def test_plain_clone(clone):
     assert python_use(clone).is_relative_to(clone)
 
 
+@pytest.mark.slow
 def test_editable(clone, tmp_path):
     venv.create(tmp_path / "venv", with_pip=True)
     python = tmp_path / "venv" / "bin" / "python"
@@ -145,6 +147,7 @@ def test_the_c_engine_does_not_import_mjx():
     assert printed(code) == "False\n"
 
 
+@pytest.mark.slow
 def test_mjx_is_imported_without_searches_for_garbage():
     code = """if True:
         import gc, mjx_walk

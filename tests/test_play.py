@@ -8,7 +8,7 @@ import imageio.v3 as iio
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from helpers import ENVIRONMENT, command, command_here, renders
+from helpers import ENVIRONMENT, command, command_here, renders, slow_except
 
 import mjx_walk
 from mjx_walk.utils.errors import UserError
@@ -92,6 +92,7 @@ def test_play_prints_a_one_line_error(tmp_path, monkeypatch, capsys):
         assert line.startswith("error: ") and message in line
 
 
+@pytest.mark.slow
 def test_jax_has_not_chosen_a_device_before_the_command_does():
     """Else `stay_on_cpu` would come too late where there is a GPU."""
     code = "import mjx_walk.play, mjx_walk.export; from jax._src import xla_bridge; print(list(xla_bridge._backends))"
@@ -123,7 +124,7 @@ def test_a_renderer_is_tried_in_a_process_of_its_own(monkeypatch):
         assert rendering._works.__wrapped__("x") is works
 
 
-@pytest.mark.parametrize("value", ["foo", "osmesa", ""])
+@pytest.mark.parametrize("value", slow_except(["foo"], ["foo", "osmesa", ""]))
 def test_only_rendering_needs_a_working_opengl(value, tmp_path):
     """OSMesa's library is missing on most machines; where it is installed, the film is written."""
     env = ENVIRONMENT | {"MUJOCO_GL": value}

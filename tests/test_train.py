@@ -135,6 +135,7 @@ def test_eval_command(finished, capsys):
     file.write_text(json.dumps(before))
 
 
+@pytest.mark.slow
 def test_a_sweep_puts_each_job_in_its_own_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arguments = [*TINY, f"total_steps={TINY_CALL}"]

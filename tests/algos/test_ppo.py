@@ -107,6 +107,7 @@ def test_small_batch_training_learns(physics):
     assert late[0] / late[1] > 2.5 * early[0] / early[1]
 
 
+@pytest.mark.slow
 def test_options_train():
     task = make_env("walker2d", physics="c")
     config = dataclasses.replace(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import toy_tasks
 from brax.training.acme import running_statistics
-from helpers import OPTIMIZED
+from helpers import OPTIMIZED, slow_except
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.common import networks
@@ -104,8 +104,9 @@ def trained(name):
     return dict(zip(toy_tasks.OneOf.TASKS, zip(value, action, strict=True), strict=True))
 
 
-algorithms = pytest.mark.parametrize("name", list(SETTINGS))
-with_values = pytest.mark.parametrize("name", [name for name in SETTINGS if name != "reinforce"])
+FAST = ("ppo", "sac")
+algorithms = pytest.mark.parametrize("name", slow_except(FAST, SETTINGS))
+with_values = pytest.mark.parametrize("name", slow_except(FAST, [name for name in SETTINGS if name != "reinforce"]))
 
 
 @with_values
@@ -125,7 +126,7 @@ def test_discounting(name):
     assert value[[1, 2]] == pytest.approx([DISCOUNT, 1.0], abs=0.05)
 
 
-@pytest.mark.parametrize("name", ["csac", "sac", "td3"])
+@pytest.mark.parametrize("name", slow_except(["sac"], ["csac", "sac", "td3"]))
 def test_a_discount_that_changes(name):
     """The horizon grows from 2 steps to 8 during the first half of the training."""
     changes = {"final_discount": 0.875, "schedule_steps": 200 * 32}
@@ -133,6 +134,7 @@ def test_a_discount_that_changes(name):
     assert np.asarray(value)[[1, 2]] == pytest.approx([0.875, 1.0], abs=0.05)
 
 
+@pytest.mark.slow
 def test_an_entropy_that_changes():
     make, config_class = ALGORITHMS["sac"]
     changes = {"target_entropy": 0.3, "final_target_entropy": -1.0, "schedule_steps": 300 * 32}
@@ -192,7 +194,7 @@ def test_mountain_car_equals_gymnasiums():
     assert ends >= 1
 
 
-@pytest.mark.parametrize("name", ["sac", pytest.param("csac", marks=pytest.mark.slow), "td3", "ddpg"])
+@pytest.mark.parametrize("name", slow_except(["sac"], ["sac", "csac", "td3", "ddpg"]))
 def test_mountain_car_is_solved(name):
     """No reward until the top, which noise reaches only when each draw is kept for a while. Solved is 90."""
     changes = {

@@ -97,6 +97,7 @@ def test_custom_reward_replaces_gymnasiums(custom):
     assert float(after.reward) == pytest.approx(sum(float(after.metrics[name]) for name in task.reward_terms), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_policy_trained_on_a_custom_reward_is_scored_by_gymnasium(custom, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = api.run(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import wrappers
 from gymnasium.wrappers import vector
-from helpers import renders
+from helpers import renders, slow_except
 from side_by_side import assert_same, make_both, outcome
 
 TASKS = ("Walker2d-v5", "Humanoid-v5")
@@ -141,7 +141,7 @@ def frame_outcomes(wrap, *arguments, **keywords):
 
 @renders
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", FRAME_WRAPPERS)
+@pytest.mark.parametrize("name", slow_except(["AddRenderObservation", "HumanRendering"], FRAME_WRAPPERS))
 def test_wrapper_of_frames(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert_same(*frame_outcomes(FRAME_WRAPPERS[name], **FRAMES))

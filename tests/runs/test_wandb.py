@@ -40,6 +40,7 @@ def history(path):
     return rows
 
 
+@pytest.mark.slow
 def test_rows_are_logged_and_a_resumed_run_continues_the_same_one(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
@@ -71,6 +72,7 @@ def test_without_the_package_nothing_is_begun(tmp_path, monkeypatch):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_without_a_login_nothing_is_begun(tmp_path):
     """In a process of its own, which has no terminal to ask."""
     env = {"HOME": str(tmp_path), "WANDB_MODE": "online", "WANDB_SILENT": "true", "WANDB_API_KEY": ""}

@@ -190,6 +190,7 @@ def test_a_run_that_saved_nothing_begins_again(tmp_path):
     assert len((run_dir / "metrics.jsonl").read_text().splitlines()) == 2
 
 
+@pytest.mark.slow
 def test_a_longer_schedule_may_be_given_and_its_end_is_reported(tmp_path, capsys):
     run_dir, linear = tmp_path / "2026_11_23", ("algo.learning_rate_schedule=linear", "algo.schedule_steps=128")
     train_here(run_dir, f"total_steps={2 * TINY_CALL}", *linear)
@@ -212,6 +213,7 @@ def sigterm(*_):
 
 
 @pytest.mark.parametrize(("end", "code", "shown"), [(ctrl_c, 130, "Ctrl-C"), (sigterm, 143, "SIGTERM")])
+@pytest.mark.slow
 def test_a_signal_while_a_policy_is_scored_says_how_to_score_it(tmp_path, monkeypatch, capsys, end, code, shown):
     monkeypatch.setattr("mjx_walk.training.recorder.score_in_gymnasium", end)
     full = (*TINY, "evaluation.gymnasium_episodes=2", f"total_steps={TINY_CALL}", f"run_dir={tmp_path / 'run'}")

@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
-from helpers import command, command_here
+from helpers import command, command_here, slow_except
 
 import mjx_walk
 from mjx_walk import zoo
@@ -15,6 +15,7 @@ from mjx_walk.runs.scores import read_scores
 from mjx_walk.utils.settings import has_effect
 
 NAMES = zoo.names()
+FAST = ("humanoid-csac", "humanoid_standup-td3", "walker2d-ppo", "pusher-csac")
 
 
 def test_three_tasks_and_the_main_algorithms_are_there():
@@ -22,7 +23,7 @@ def test_three_tasks_and_the_main_algorithms_are_there():
     assert wanted | {"humanoid-csac"} <= set(NAMES)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_except(FAST, NAMES))
 def test_a_policy_is_small_and_scores_about_what_it_did(name):
     folder = zoo.open_run(f"zoo:{name}")
     assert sum(path.stat().st_size for path in folder.path.rglob("*") if path.is_file()) < 1_000_000
@@ -35,7 +36,7 @@ def test_a_policy_is_small_and_scores_about_what_it_did(name):
     assert scores.mean == pytest.approx(block["returns"][0], rel=0.2)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_except(FAST, NAMES))
 def test_its_command_gives_its_settings(name):
     folder = zoo.open_run(f"zoo:{name}")
     config = read_config(folder.config)
