@@ -22,34 +22,36 @@ from mjx_walk.utils.types import Transition
 NUM_ENVS, BATCH, UPDATES = 16, 32, 5
 
 
+CONFIG = SACConfig(
+    unroll_length=1,
+    grad_updates_per_step=UPDATES,
+    batch_size=BATCH,
+    replay_capacity=256,
+    learning_starts=0,
+    policy_learning_rate=1e-3,
+    critic_learning_rate=1e-3,
+    reward_scale=2.0,
+    observation_clip=None,
+    policy_hidden_layer_sizes=(32, 32),
+    critic_hidden_layer_sizes=(32, 32),
+)
+
+
 def test_sac_update_equals_brax(monkeypatch):
     """Brax's own trainer, given our networks, our steps and our samples, ends at our parameters after five updates.
 
     Noise is a fixed function of the shape, since the two draw their keys in another order.
     """
-    config = SACConfig(
-        unroll_length=1,
-        grad_updates_per_step=UPDATES,
-        batch_size=BATCH,
-        replay_capacity=256,
-        learning_starts=0,
-        policy_learning_rate=1e-3,
-        critic_learning_rate=1e-3,
-        reward_scale=2.0,
-        observation_clip=None,
-        policy_hidden_layer_sizes=(32, 32),
-        critic_hidden_layer_sizes=(32, 32),
-    )
     task = make_env("walker2d", physics="c")
-    algorithm = SAC(task, NUM_ENVS, EvaluationConfig(1), config)
+    algorithm = SAC(task, NUM_ENVS, EvaluationConfig(1), CONFIG)
     state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
     collect, learn = jax.jit(algorithm.collect), jax.jit(algorithm.learn)
     for _ in range(4):
         state, _ = learn(*collect(state))
     state, (steps, stats) = collect(state)
     buffer = ReplayBuffer(task, NUM_ENVS, 16)
-    drawn = buffer.sample(state.replay, jax.random.PRNGKey(7), UPDATES * BATCH, 1, config.discount)
-    assert set(np.asarray(drawn.discount)) <= {0.0, np.float32(config.discount)}
+    drawn = buffer.sample(state.replay, jax.random.PRNGKey(7), UPDATES * BATCH, 1, CONFIG.discount)
+    assert set(np.asarray(drawn.discount)) <= {0.0, np.float32(CONFIG.discount)}
 
     monkeypatch.setattr(ReplayBuffer, "sample", lambda *_: drawn)
     monkeypatch.setattr(jax.random, "normal", lambda key, shape: jnp.sin(jnp.arange(np.prod(shape)).reshape(shape)))
@@ -58,30 +60,19 @@ def test_sac_update_equals_brax(monkeypatch):
     metrics = values(metrics)
     assert int(ours.critic_updates - state.critic_updates) == UPDATES
 
-    begin = brax_sac._init_training_state
+    theirs = brax_after_its_updates(state, steps, drawn, monkeypatch)
+    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), ours.learner.critic, state.learner.critic)
+    assert max(jax.tree.leaves(moved)) > 1e-3
+    expected = (theirs.policy_params, theirs.q_params, theirs.target_q_params, theirs.alpha_params)
+    learner = ours.learner
+    result = (learner.policy, _as_brax(learner.critic), _as_brax(learner.target_critic), learner.log_alpha)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6), result, expected)
+    np.testing.assert_allclose(ours.normalizer.mean, theirs.normalizer_params.mean, rtol=1e-5, atol=1e-6)
+    assert metrics["alpha"] == pytest.approx(float(jnp.exp(theirs.alpha_params)), rel=1e-2)
 
-    def begin_with_ours(**kwargs):
-        learner = state.learner
-        theirs = begin(**kwargs)
-        replaced = {
-            "policy_params": learner.policy,
-            "q_params": _as_brax(learner.critic),
-            "target_q_params": _as_brax(learner.target_critic),
-            "alpha_params": learner.log_alpha,
-            "normalizer_params": state.normalizer,
-        }
-        theirs = theirs.replace(**jax.tree.map(lambda x: x[None], replaced))
-        return theirs.replace(
-            policy_optimizer_state=_adam(theirs.policy_optimizer_state, learner.policy_optimizer),
-            q_optimizer_state=_adam(
-                theirs.q_optimizer_state,
-                learner.critic_optimizer._replace(
-                    mu=_as_brax(learner.critic_optimizer.mu), nu=_as_brax(learner.critic_optimizer.nu)
-                ),
-            ),
-            alpha_optimizer_state=_adam(theirs.alpha_optimizer_state, learner.alpha_optimizer),
-        )
 
+def brax_after_its_updates(state, steps, drawn, monkeypatch):
+    """Brax's training state after `UPDATES` updates on the drawn batch, from our parameters."""
     stored = drawn._replace(
         observation=steps.observation[0],
         action=steps.action[0],
@@ -90,9 +81,10 @@ def test_sac_update_equals_brax(monkeypatch):
         next_observation=steps.next_observation[0],
         extras={"state_extras": {"truncation": jnp.zeros(NUM_ENVS)}, "policy_extras": {}},
     )
-    as_theirs = drawn._replace(discount=drawn.discount / config.discount, extras=drawn.extras | {"policy_extras": {}})
+    as_theirs = drawn._replace(discount=drawn.discount / CONFIG.discount, extras=drawn.extras | {"policy_extras": {}})
     found = {}
-    monkeypatch.setattr(brax_sac, "_init_training_state", begin_with_ours)
+    begin = brax_sac._init_training_state
+    monkeypatch.setattr(brax_sac, "_init_training_state", lambda **kwargs: with_our_parameters(begin(**kwargs), state))
     monkeypatch.setattr(acting, "actor_step", lambda env, env_state, *args, **kwargs: (env_state, stored))
     queue = brax_sac.replay_buffers.UniformSamplingQueue
     monkeypatch.setattr(queue, "sample", lambda self, buffer_state: (buffer_state, as_theirs))
@@ -106,26 +98,39 @@ def test_sac_update_equals_brax(monkeypatch):
         num_envs=NUM_ENVS,
         num_eval_envs=1,
         learning_rate=1e-3,
-        discounting=config.discount,
+        discounting=CONFIG.discount,
         batch_size=BATCH,
         normalize_observations=True,
-        reward_scaling=config.reward_scale,
-        tau=config.tau,
+        reward_scaling=CONFIG.reward_scale,
+        tau=CONFIG.tau,
         max_replay_size=256,
         grad_updates_per_step=UPDATES,
         network_factory=lambda *args, **kwargs: brax_networks.make_sac_networks(
             *args, hidden_layer_sizes=(32, 32), **kwargs
         ),
     )
-    theirs = jax.tree.map(lambda x: x[0], found["state"])
-    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), ours.learner.critic, state.learner.critic)
-    assert max(jax.tree.leaves(moved)) > 1e-3
-    expected = (theirs.policy_params, theirs.q_params, theirs.target_q_params, theirs.alpha_params)
-    learner = ours.learner
-    result = (learner.policy, _as_brax(learner.critic), _as_brax(learner.target_critic), learner.log_alpha)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6), result, expected)
-    np.testing.assert_allclose(ours.normalizer.mean, theirs.normalizer_params.mean, rtol=1e-5, atol=1e-6)
-    assert metrics["alpha"] == pytest.approx(float(jnp.exp(theirs.alpha_params)), rel=1e-2)
+    return jax.tree.map(lambda x: x[0], found["state"])
+
+
+def with_our_parameters(theirs, state):
+    """Brax's first training state, with our parameters, statistics and optimizers' moments."""
+    learner = state.learner
+    replaced = {
+        "policy_params": learner.policy,
+        "q_params": _as_brax(learner.critic),
+        "target_q_params": _as_brax(learner.target_critic),
+        "alpha_params": learner.log_alpha,
+        "normalizer_params": state.normalizer,
+    }
+    theirs = theirs.replace(**jax.tree.map(lambda x: x[None], replaced))
+    critic_moments = learner.critic_optimizer._replace(
+        mu=_as_brax(learner.critic_optimizer.mu), nu=_as_brax(learner.critic_optimizer.nu)
+    )
+    return theirs.replace(
+        policy_optimizer_state=_adam(theirs.policy_optimizer_state, learner.policy_optimizer),
+        q_optimizer_state=_adam(theirs.q_optimizer_state, critic_moments),
+        alpha_optimizer_state=_adam(theirs.alpha_optimizer_state, learner.alpha_optimizer),
+    )
 
 
 def batch(remaining=1.0):
