@@ -68,13 +68,22 @@ class _Handler(logging.Handler):
             print(text, file=sys.stderr if is_warning or is_progress else sys.stdout, flush=True)
 
 
-def _in_one_line(
-    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
-) -> str:
-    """Format a warning for users as one line, without its source code."""
-    if category is UserWarning:
-        return f"warning: {printable(str(message))}\n"
-    return _usual_format(message, category, filename, lineno, line)
+class _OneLineOnce:
+    """Formats warnings for users: one line without source code, and each line once, however many places say it."""
+
+    def __init__(self) -> None:
+        self._shown: set[str] = set()
+
+    def __call__(
+        self, message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+    ) -> str:
+        if category is not UserWarning:
+            return _usual_format(message, category, filename, lineno, line)
+        text = f"warning: {printable(str(message))}\n"
+        if text in self._shown:
+            return ""
+        self._shown.add(text)
+        return text
 
 
 def _say_nothing_of_interrupts(unraisable: Any) -> None:
@@ -94,7 +103,7 @@ def console() -> Iterator[None]:
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
     logger.propagate = False  # other libraries may have added handlers to the root logger
-    warnings.formatwarning = _in_one_line
+    warnings.formatwarning = _OneLineOnce()  # type: ignore[assignment]
     unraisable_hook, sys.unraisablehook = sys.unraisablehook, _say_nothing_of_interrupts
     try:
         yield

@@ -12,6 +12,7 @@ from helpers import ENVIRONMENT, TINY, TINY_CALL, command_here
 
 import mjx_walk
 from mjx_walk.utils import cli
+from mjx_walk.utils.console import console
 
 
 def test_commands_print_messages_without_prefix_and_warnings_in_one_line(capsys, monkeypatch):
@@ -30,6 +31,12 @@ def test_commands_print_messages_without_prefix_and_warnings_in_one_line(capsys,
     assert ended.value.code == 1 and logging.getLogger("mjx_walk").handlers == handlers
     printed = capsys.readouterr()
     assert printed.out == "50 done\n" and printed.err == "5 steps\nwarning: beware\n"
+
+
+def test_a_warning_from_two_places_is_shown_once():
+    with console():
+        shown = [warnings.formatwarning("look out", UserWarning, file, 1) for file in ("a.py", "b.py")]
+    assert shown == ["warning: look out\n", ""]
 
 
 def test_from_python_a_run_is_quiet_and_logs(tmp_path, capfd, caplog):
