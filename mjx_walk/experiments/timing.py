@@ -15,7 +15,7 @@ from mjx_walk.utils.signals import as_by_ctrl_c
 from mjx_walk.utils.subprocesses import start_module, with_parent
 
 _PATIENCE = 60.0
-"""Least time in seconds after which a training without a new row hangs, and longest time that one may take to end."""
+"""Seconds: a training hangs if it logs no row for at least this long, and is killed if it takes longer to end."""
 
 
 class Measurement(NamedTuple):

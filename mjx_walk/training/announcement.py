@@ -42,4 +42,4 @@ def announce(config: Config, folders: list[RunFolder], num_devices: int) -> None
     if config.physics == "warp":
         _LOGGER.info("On the first run on a machine, Warp compiles its kernels, which takes about a minute.")
         if config.profile_calls > 1 and num_devices == 1:
-            _LOGGER.warning("JAX's profiler hangs in the second recorded call of Warp on one H200; use profile_calls=1")
+            _LOGGER.warning("JAX's profiler has hung in a second recorded call of Warp on one GPU; use profile_calls=1")

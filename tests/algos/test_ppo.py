@@ -10,7 +10,7 @@ from brax.training import acting
 from brax.training.agents.ppo import networks as brax_networks
 from brax.training.agents.ppo import train as brax_ppo
 from brax.training.agents.ppo.losses import PPONetworkParams
-from helpers import values
+from helpers import slow_except, values
 from toy_tasks import BraxSizes, ConstantReward, EndlessReward
 
 from mjx_walk.algos.on_policy import _make_optimizer
@@ -89,7 +89,7 @@ def test_ppo_update_equals_brax(monkeypatch):
     assert all(np.isfinite(value) for name, value in metrics.items() if not name.startswith("eval"))
 
 
-@pytest.mark.parametrize("physics", ["c", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("physics", slow_except(["c"], ["c", "jax"]))
 def test_small_batch_training_learns(physics):
     """Sixteen walkers that are rewarded for standing learn to stand longer."""
     task = make_env("walker2d", physics=physics, forward_reward_weight=0.0)

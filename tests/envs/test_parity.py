@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from helpers import slow_except
 
 from mjx_walk import parity as parity_command
 from mjx_walk.envs import TASKS, make_env
@@ -113,7 +114,7 @@ def test_copies_is_read_as_num_envs_with_one_warning():
     assert len(warned) == 1
 
 
-@pytest.mark.parametrize("physics", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
+@pytest.mark.parametrize("physics", slow_except(["warp"], ["jax", "warp"]))
 def test_reset_observation_equals_the_c_engine(physics):
     keys = jax.random.split(jax.random.PRNGKey(0), 4)
     expected = jax.vmap(make_env("humanoid", physics="c").reset)(keys)

@@ -7,13 +7,13 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from helpers import renders
+from helpers import renders, slow_except
 from side_by_side import assert_same, make_both
 
 from mjx_walk.utils.errors import UserError
 
 
-@pytest.mark.parametrize("physics", ["c", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("physics", slow_except(["c"], ["c", "jax"]))
 def test_many_side_by_side(physics):
     """Environments that fall or reach the limit reset in the same step. Their last observation is in `final_obs`."""
     envs = gymnasium.make_vec(

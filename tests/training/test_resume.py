@@ -19,6 +19,7 @@ from helpers import (
     finish,
     flip_a_byte,
     leaves,
+    slow_except,
     start,
     train,
     train_here,
@@ -43,7 +44,7 @@ def six_calls(tmp_path_factory):
     return on
 
 
-@pytest.mark.parametrize("physics", ["c", *(pytest.param(name, marks=pytest.mark.slow) for name in ("jax", "warp"))])
+@pytest.mark.parametrize("physics", slow_except(["c"], ["c", "jax", "warp"]))
 def test_n_and_n_calls_equal_2n(tmp_path, physics, six_calls):
     train_here(tmp_path / "halves", f"physics={physics}", f"total_steps={3 * TINY_CALL}")
     train(tmp_path / "halves", "resume=true", f"total_steps={6 * TINY_CALL}", tiny=[])
@@ -120,7 +121,7 @@ def test_a_damaged_checkpoint_costs_only_its_own_calls(tmp_path, six_calls):
     assert [row["env_steps"] for row in rows] == [i * TINY_CALL for i in range(1, 7)]
 
 
-@pytest.mark.parametrize("name", ["SIGINT", *(pytest.param(x, marks=pytest.mark.slow) for x in ("SIGTERM", "SIGUSR1"))])
+@pytest.mark.parametrize("name", slow_except(["SIGINT"], ["SIGINT", "SIGTERM", "SIGUSR1"]))
 def test_signals_finish_the_call_save_and_say_how_to_continue(tmp_path, name):
     run_dir = tmp_path / "run"
     process = start("train", *TINY, f"run_dir={run_dir}", "total_steps=100000000")

@@ -11,8 +11,9 @@ from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import load_config
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.saved_config import save_config
+from mjx_walk.training import seeds_together
 from mjx_walk.training.seeds_together import have_saved, restore_together
-from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.errors import UnreadableError, UserError
 
 SEEDS = "seeds=[3,5]"
 
@@ -109,6 +110,16 @@ def test_seeds_that_a_kill_has_parted_at_their_first_save_begin_again(tmp_path, 
         return
     with pytest.raises(UserError, match=rf"the seeds are at different steps \(0, {steps[-1]}\); resume each alone"):
         have_saved(folders)
+
+
+def test_seeds_of_which_one_cannot_be_read_now_neither_begin_again_nor_part(tmp_path, monkeypatch):
+    def fail(path):
+        raise UnreadableError(f"cannot read {path}")
+
+    (tmp_path / "1" / "checkpoints" / f"{10:013d}").mkdir(parents=True)
+    monkeypatch.setattr(seeds_together, "read_meta", fail)
+    with pytest.raises(UnreadableError, match="cannot read"):
+        have_saved([RunFolder(tmp_path / name) for name in ("1", "2")])
 
 
 def test_nothing_is_begun_where_one_seed_cannot_be(tmp_path, monkeypatch):
