@@ -171,11 +171,12 @@ def train(
     physics = resolve_engine(configs[0].physics)
     configs = [dataclasses.replace(config, physics=physics) for config in configs]
     processes = processes or Processes()
-    with temporary_jax_settings(configs[0].matmul_precision), contextlib.ExitStack() as locks:
+    with temporary_jax_settings(configs[0].matmul_precision), contextlib.ExitStack() as closing:
         task = make_task(configs[0])
+        closing.callback(task.engine.preparation.cancel)
         if task.reward_hashes and processes.is_main_process:
             remember(configs[0].env.reward_function, task.reward_hashes)
-        folders, configs = _prepare(configs, task, processes, locks)
+        folders, configs = _prepare(configs, task, processes, closing)
         trainer = Trainer(configs, task, folders, on_metrics, processes)
         with as_by_ctrl_c(), contextlib.closing(trainer):
             signal_name = trainer.train()
@@ -187,17 +188,17 @@ def train(
 
 
 def _prepare(
-    configs: list[Config], task: Task, processes: Processes, locks: contextlib.ExitStack
+    configs: list[Config], task: Task, processes: Processes, closing: contextlib.ExitStack
 ) -> tuple[list[RunFolder], list[Config]]:
     """Check that the runs fit this machine, and prepare their folders. All processes get the main one's folder.
 
-    The main process locks the folders until `locks` is closed.
+    The main process locks the folders until `closing` is closed.
     """
     algorithm = make_algorithm(task, configs[0].num_envs, configs[0].evaluation, configs[0].algo)
     replay = check_replay(algorithm, Path(configs[0].run_dir or "."), len(configs))
     folders: list[RunFolder] = []
     if processes.is_main_process:
-        folders, configs = locks.enter_context(prepared(configs))
+        folders, configs = closing.enter_context(prepared(configs))
         announce(configs[0], folders, processes.process_count)
         if replay:
             _LOGGER.info(replay)

@@ -10,12 +10,13 @@ import jax
 import mujoco
 
 from mjx_walk.envs.physics.base import Derived, Engine, PhysicsState
+from mjx_walk.envs.physics.preparation import nothing_runs
 from mjx_walk.envs.physics.supported import refuse_unsupported, unsupported_by_mjx, warn_of_approximations
 from mjx_walk.utils.errors import UserError
 
 ENGINES = ("warp", "jax", "c")
 
-__all__ = ["ENGINES", "Derived", "Engine", "PhysicsState", "make_engine", "resolve_engine"]
+__all__ = ["ENGINES", "Derived", "Engine", "PhysicsState", "make_engine", "nothing_runs", "resolve_engine"]
 
 
 def resolve_engine(name: str) -> str:

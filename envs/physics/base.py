@@ -11,6 +11,7 @@ from jax import Array
 from jax.custom_batching import custom_vmap
 from jaxtyping import Bool, Float
 
+from mjx_walk.envs.physics.preparation import Preparation
 from mjx_walk.utils.compat import standard_dtypes
 from mjx_walk.utils.errors import UserError
 
@@ -51,6 +52,8 @@ class Engine(Protocol):
     name: str
     calls_host: bool
     """Whether it steps in a host callback. JAX does not cache compiled programs that contain one."""
+    preparation: Preparation
+    """What must end before its programs run."""
 
     def forward(self, state: PhysicsState) -> Derived:
         """Derived arrays of a new state at zero control. Source: Gymnasium's `set_state` (`mj_forward`)."""

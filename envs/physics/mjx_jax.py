@@ -17,6 +17,7 @@ from mujoco.mjx._src import types as mjx_types
 from mjx_walk.envs.physics import capsule_frames_jax
 from mjx_walk.envs.physics.base import Derived, PhysicsState
 from mjx_walk.envs.physics.mjx_model import check_derived, read_derived, with_newton_solver
+from mjx_walk.envs.physics.preparation import Preparation
 
 _RK4_STEP = (0.0, 0.5, 0.5, 1.0)
 _RK4_WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
@@ -35,6 +36,7 @@ class JaxEngine:
         self._blank = mjx.make_data(model, impl="jax")
         self._substep = _runge_kutta_4 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else _euler
         self._num_substeps = num_substeps
+        self.preparation = Preparation()
         self._derived = check_derived(model, derived, mjx_types.DataJAX)
 
     def change_model(self, changes: dict[str, Array]) -> None:

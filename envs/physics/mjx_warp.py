@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from concurrent.futures import Future
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,8 @@ from mujoco.mjx.warp.types import DataWarp
 from mjx_walk.envs.physics import capsule_frames_warp
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.mjx_model import check_derived, read_derived, with_newton_solver
+from mjx_walk.envs.physics.preparation import Preparation
+from mjx_walk.envs.physics.warp_kernels import load_kernels
 
 CONTACTS_PER_ENV = 40
 """Mean capacity per environment for candidate geom pairs, and for contacts. The batch shares both buffers.
@@ -54,16 +57,21 @@ class WarpEngine:
         self._num_substeps = num_substeps
         # Equality constraints and frictional joints have a row each in every step, unlike contacts and limits.
         with_friction = np.count_nonzero(model.dof_frictionloss) + np.count_nonzero(model.tendon_frictionloss)
-        self._num_standing_rows = model.neq + with_friction
+        self._njmax = CONSTRAINTS_PER_ENV + model.neq + int(with_friction)
         self._derived = check_derived(model, derived, DataWarp)
+        self.preparation = Preparation(self._load_kernels)
         self.forward = batch_once(self._forward)
         self.step = batch_once(self._step)
+
+    def _load_kernels(self) -> list[Future]:
+        return load_kernels(self._mj_model, self._njmax, wp.device_from_jax(jax.local_devices()[0]))
 
     def _data(self, state: PhysicsState) -> mjx.Data:
         """Warp's data for the entire batch.
 
         Most arrays are zeros. The program allocates them itself instead of holding them as constants.
         """
+        self.preparation.before_trace()
         num_envs = state.qpos.shape[0]
         with jax.ensure_compile_time_eval():
             blank = mjx.make_data(
@@ -71,7 +79,7 @@ class WarpEngine:
                 impl="warp",
                 device=jax.local_devices()[0],
                 naconmax=CONTACTS_PER_ENV * num_envs + SPARE_CONTACTS,
-                njmax=CONSTRAINTS_PER_ENV + self._num_standing_rows,
+                njmax=self._njmax,
             )
             blank = jax.tree.map(np.asarray, blank)
         blank = jax.tree.map(lambda x: jnp.array(x) if x.any() else jnp.zeros(x.shape, x.dtype), blank)

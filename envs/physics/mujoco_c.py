@@ -14,6 +14,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once, derived_shapes
+from mjx_walk.envs.physics.preparation import Preparation
 
 _WARNING = mujoco.mjtWarning
 _BAD_STATE = [int(_WARNING.mjWARN_BADQPOS), int(_WARNING.mjWARN_BADQVEL), int(_WARNING.mjWARN_BADQACC)]
@@ -34,6 +35,7 @@ class CEngine:
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
         self._model = model
         self._num_substeps = num_substeps
+        self.preparation = Preparation()
         self._derived_shapes = derived_shapes(model, derived)
         self._num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._workspaces = [mujoco.MjData(model) for _ in range(self._num_threads)]

@@ -8,6 +8,7 @@ import jax
 from jax.extend import core
 
 from mjx_walk.algos import Algorithm
+from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.utils.collectives import DEVICES
 
 _REDUCTIONS = ("psum", "pmax", "all_gather")
@@ -43,7 +44,8 @@ def reduced_bytes(algorithm: Algorithm, num_devices: int) -> float:
 
 def _learning_inputs(algorithm: Algorithm) -> tuple[Any, Any]:
     """Shapes of the arguments of `learn`."""
-    return jax.eval_shape(algorithm.collect, jax.eval_shape(algorithm.init, jax.random.PRNGKey(0)))
+    with nothing_runs():
+        return jax.eval_shape(algorithm.collect, jax.eval_shape(algorithm.init, jax.random.PRNGKey(0)))
 
 
 def _total(jaxpr: core.Jaxpr, cost: Callable[[core.JaxprEqn], float]) -> float:

@@ -168,3 +168,9 @@ def write_csv(rows: list[Row], path: Path) -> Path:
 def _as_cell(value: Any) -> Any:
     """A value that a spreadsheet does not take for a formula."""
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+
+
+def mean_row(rows: list[Row]) -> Row:
+    """Means over the runs that have a value, for display."""
+    values = {name: [row[name] for row in rows if name in row] for name in {name for row in rows for name in row}}
+    return {name: sum(found) / len(found) for name, found in values.items()}

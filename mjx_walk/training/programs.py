@@ -4,8 +4,9 @@ The trainer calls their functions and does not know which of them it runs.
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,8 @@ from mjx_walk.algos import Algorithm, TrainState, is_finite
 from mjx_walk.utils.types import Metrics
 
 Step = Callable[[TrainState], tuple[TrainState, Metrics]]
+Lower = Callable[[list[jax.Array]], Iterator[jax.stages.Lowered]]
+"""`keys of the runs → programs`, traced one by one. A later call of a program finds it compiled."""
 
 
 class Program(NamedTuple):
@@ -24,6 +27,8 @@ class Program(NamedTuple):
     """`keys of the runs → state`."""
     step: Step
     """One call: `state → (state, metrics)`, several iterations. It consumes the state."""
+    lower: Lower
+    """The programs of `init` and `step`, for compiling them before they run."""
     split: Callable[[TrainState], list[TrainState]]
     """The state of each run, without an axis in front; on the host if there was one."""
     merge: Callable[[list[TrainState]], TrainState]
@@ -38,7 +43,7 @@ class Program(NamedTuple):
     """The largest of the numbers that the processes pass."""
 
 
-def make_init(init: Callable[[jax.Array], TrainState]) -> Callable[[jax.Array], TrainState]:
+def make_init(init: Callable[[jax.Array], TrainState]) -> jax.stages.Wrapped:
     """Compile `key → TrainState` without weak types, with which the first call would compile twice."""
 
     def strong(key):
@@ -47,8 +52,20 @@ def make_init(init: Callable[[jax.Array], TrainState]) -> Callable[[jax.Array], 
     return jax.jit(strong)
 
 
-def make_step(collect: Callable, learn: Callable, iterations_per_call: int, fused: bool) -> Step:
-    """Compile several iterations into one call.
+class CompiledStep(Protocol):
+    """A step that is compiled when it is first called, or before from what it lowers."""
+
+    def __call__(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        """One call."""
+        ...
+
+    def lower(self, state: TrainState) -> Iterator[jax.stages.Lowered]:
+        """Trace the step's programs for a state or its shapes."""
+        ...
+
+
+def make_step(collect: Callable, learn: Callable, iterations_per_call: int, fused: bool) -> CompiledStep:
+    """Make a step of several iterations.
 
     Args:
         collect: `TrainState → (TrainState, batch)`.
@@ -57,31 +74,62 @@ def make_step(collect: Callable, learn: Callable, iterations_per_call: int, fuse
         fused: compile both into one program. Engines that call back to the host need separate programs, because JAX
             does not keep programs with callbacks in its compile cache.
     """
+    return (_OneProgram if fused else _TwoPrograms)(collect, learn, iterations_per_call)
 
-    def iterate(state, _):
-        return learn(*collect(state))
 
-    if fused:
-        return jax.jit(lambda state: jax.lax.scan(iterate, state, length=iterations_per_call), donate_argnums=0)
-    compiled_collect, compiled_learn = jax.jit(collect, donate_argnums=0), jax.jit(learn, donate_argnums=0)
+class _OneProgram:
+    def __init__(self, collect: Callable, learn: Callable, iterations_per_call: int):
+        def iterate(state, _):
+            return learn(*collect(state))
 
-    def step(state: TrainState) -> tuple[TrainState, Metrics]:
+        self._call = jax.jit(lambda state: jax.lax.scan(iterate, state, length=iterations_per_call), donate_argnums=0)
+
+    def __call__(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        return self._call(state)
+
+    def lower(self, state: TrainState) -> Iterator[jax.stages.Lowered]:
+        yield self._call.lower(state)
+
+
+class _TwoPrograms:
+    def __init__(self, collect: Callable, learn: Callable, iterations_per_call: int):
+        self._collect = jax.jit(collect, donate_argnums=0)
+        self._learn = jax.jit(learn, donate_argnums=0)
+        self._iterations_per_call = iterations_per_call
+
+    def __call__(self, state: TrainState) -> tuple[TrainState, Metrics]:
         rows = []
-        for _ in range(iterations_per_call):
-            state, metrics = compiled_learn(*compiled_collect(state))
+        for _ in range(self._iterations_per_call):
+            state, metrics = self._learn(*self._collect(state))
             rows.append(metrics)
         return state, jax.tree.map(lambda *xs: jnp.stack(xs), *rows)
 
-    return step
+    def lower(self, state: TrainState) -> Iterator[jax.stages.Lowered]:
+        yield self._collect.lower(state)
+        yield self._learn.lower(*jax.eval_shape(self._collect, state))
+
+
+def _lower_both(init: jax.stages.Wrapped, step: CompiledStep, keys: jax.Array) -> Iterator[jax.stages.Lowered]:
+    yield init.lower(keys)
+    yield from step.lower(jax.eval_shape(init, keys))
+
+
+def compile_together(programs: list[jax.stages.Lowered]) -> None:
+    """Compile each program in a thread of its own."""
+    with ThreadPoolExecutor() as pool:
+        for compiling in [pool.submit(program.compile) for program in programs]:
+            compiling.result()
 
 
 def make_single_program(algorithm: Algorithm, iterations_per_call: int, fused: bool) -> Program:
     """One run on one device."""
     check = jax.jit(is_finite)
     init = make_init(algorithm.init)
+    step = make_step(algorithm.collect, algorithm.learn, iterations_per_call, fused)
     return Program(
         init=lambda keys: init(keys[0]),
-        step=make_step(algorithm.collect, algorithm.learn, iterations_per_call, fused),
+        step=step,
+        lower=lambda keys: _lower_both(init, step, keys[0]),
         split=lambda state: [state],
         merge=lambda states: states[0],
         policies=lambda state: [algorithm.policy_params(state)],
@@ -94,11 +142,13 @@ def make_single_program(algorithm: Algorithm, iterations_per_call: int, fused: b
 def make_seeds_program(algorithm: Algorithm, num_seeds: int, iterations_per_call: int, fused: bool) -> Program:
     """Several runs that differ in their seed, in one program on one device."""
     init = make_init(jax.vmap(algorithm.init))
+    step = make_step(jax.vmap(algorithm.collect), jax.vmap(algorithm.learn), iterations_per_call, fused)
     return make_axis_program(
         algorithm,
         num_seeds,
         init=lambda keys: init(jnp.stack(keys)),
-        step=make_step(jax.vmap(algorithm.collect), jax.vmap(algorithm.learn), iterations_per_call, fused),
+        step=step,
+        lower=lambda keys: _lower_both(init, step, jnp.stack(keys)),
         split_metrics=functools.partial(_split_metrics, num_seeds),
     )
 
@@ -108,6 +158,7 @@ def make_axis_program(
     num_runs: int,
     init: Callable[[list[jax.Array]], TrainState],
     step: Step,
+    lower: Lower,
     split_metrics: Callable[[Metrics], list[Metrics]],
     max_over_processes: Callable[[int], int] = lambda number: number,
 ) -> Program:
@@ -129,6 +180,7 @@ def make_axis_program(
     return Program(
         init=init,
         step=step,
+        lower=lower,
         split=split,
         merge=merge,
         policies=policies,

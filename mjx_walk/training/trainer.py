@@ -1,6 +1,5 @@
 """The host loop: call the compiled program, log, save, and score at the end."""
 
-import collections
 import contextlib
 import functools
 import logging
@@ -16,16 +15,24 @@ import jax.numpy as jnp
 from mjx_walk.algos import TrainState, learned_leaves, make_algorithm, without_replay
 from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
+from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.envs.vector_env import check_resets
 from mjx_walk.runs.config import Config
-from mjx_walk.runs.metrics import Row, name_metrics, physics_warnings
+from mjx_walk.runs.metrics import Row, mean_row, name_metrics, physics_warnings
 from mjx_walk.runs.progress import Progress
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.training.call_profile import CallProfile
 from mjx_walk.training.distributed import Processes, make_devices_program, per_device
-from mjx_walk.training.programs import Program, make_init, make_seeds_program, make_single_program
+from mjx_walk.training.programs import (
+    Program,
+    compile_together,
+    make_init,
+    make_seeds_program,
+    make_single_program,
+)
 from mjx_walk.training.recorder import Recorder
 from mjx_walk.training.seeds_together import have_saved, restore_together
+from mjx_walk.training.speed import Speed
 from mjx_walk.training.summary import end_lines, score_lines
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
@@ -34,8 +41,6 @@ from mjx_walk.utils.types import Metrics
 
 _log = logging.getLogger(__name__)
 
-_SPEED_WINDOW = 10.0
-"""Seconds over which the logged speed is averaged."""
 _CLOSING_EVALUATION = 2**31 - 1
 """Folded into a run's seed, so that the evaluation at the end has its own episodes."""
 
@@ -80,13 +85,12 @@ class Trainer:
         self.steps_per_call = self._steps_per_iteration * config.iterations_per_call
         self.num_calls = -(-config.total_steps // self.steps_per_call)
         self._program = self._make_program()
+        self._keys = [jax.random.PRNGKey(own.seed) for own in configs]
         self._evaluate = jax.jit(
             lambda params, key: evaluate(task, algorithm.evaluator.num_envs, algorithm.policy(params), key)[0].mean()
         )
         self._on_metrics = on_metrics or (lambda row: None)
         self._started = time.monotonic()
-        self._times: collections.deque[tuple[float, int]] = collections.deque()
-        self._is_compiled = False
         self._seconds_before = 0.0
         self._warned_of: set[str] = set()
 
@@ -108,13 +112,14 @@ class Trainer:
         Raises:
             UserError: training has diverged, so that a network, an optimizer or a running statistic is not finite.
         """
-        state, call = self._start()
+        restored, call = self._restored()
         self._say_total(call)
         progress = Progress(
             self.num_calls * self.steps_per_call, call * self.steps_per_call, self._processes.is_main_process
         )
+        state = restored if restored is not None and call >= self.num_calls else self._ready_to_call(restored)
         saved_call = call or -1
-        self._times.append((time.monotonic(), call))
+        speed = Speed(call)
         for recorder in self.recorders:
             recorder.begin(call * self.steps_per_call, will_train=call < self.num_calls)
         diverged = False
@@ -124,7 +129,7 @@ class Trainer:
                 profile.next_call()
                 state, metrics = self._program.step(state)
                 call += 1
-                rows = self._rows(call, metrics)  # waits for the call, so that the row has its end time
+                rows = self._rows(call, metrics, speed)  # waits for the call, so that the row has its end time
                 self._write(state, rows, progress)
                 diverged = not self._program.is_finite(state).all()
                 if call % self.config.checkpoint.every_calls == 0:
@@ -185,20 +190,32 @@ class Trainer:
             for recorder in self.recorders:
                 closing.callback(recorder.close)
 
-    def _start(self) -> tuple[TrainState, int]:
-        """Initial or restored TrainState, and the number of completed calls."""
-        keys = [jax.random.PRNGKey(recorder.config.seed) for recorder in self.recorders]
+    def _restored(self) -> tuple[TrainState | None, int]:
+        """The saved TrainState, if there is one, and the number of completed calls."""
         if not self.config.resume or not have_saved(self._folders):
             for folder in self._folders:
                 if self.config.resume and folder.metrics.exists():
                     warnings.warn(f"{folder.path} has no checkpoint; training restarts from step 0", stacklevel=2)
-            state = self._program.init(keys)
-            check_resets(state.env)
-            return state, 0
-        restored = restore_together(self.recorders, jax.eval_shape(make_init(self._algorithm.init), keys[0]))
+            return None, 0
+        with nothing_runs():
+            like = jax.eval_shape(make_init(self._algorithm.init), self._keys[0])
+        restored = restore_together(self.recorders, like)
         self._seconds_before = max(facts["wall_seconds"] for _, facts in restored)
         calls = restored[0][1]["env_steps"] // self.steps_per_call
         return self._program.merge([state for state, _ in restored]), calls
+
+    def _ready_to_call(self, restored: TrainState | None) -> TrainState:
+        """Compile the programs while the engine gets ready. Return the state for the next call."""
+        with nothing_runs():
+            lowered = list(self._program.lower(self._keys))
+        self._task.engine.preparation.begin()  # not before, since it would slow the tracing down
+        compile_together(lowered if restored is None else lowered[1:])  # a restored run does not call `init`
+        self._task.engine.preparation.wait()
+        if restored is not None:
+            return restored
+        state = self._program.init(self._keys)
+        check_resets(state.env)
+        return state
 
     def _end(self, state: TrainState, call: int, is_stopped: bool) -> None:
         """Close the run folders. A run that stops early waits for its saves here, since no scoring follows."""
@@ -216,14 +233,14 @@ class Trainer:
         key = jax.random.fold_in(jax.random.PRNGKey(seed), _CLOSING_EVALUATION)
         return float(self._evaluate(policy_params, key))
 
-    def _rows(self, call: int, metrics: Metrics) -> list[Row]:
+    def _rows(self, call: int, metrics: Metrics, speed: Speed) -> list[Row]:
         of_runs = self._program.split_metrics(metrics)
         common = {"env_steps": call * self.steps_per_call, "wall_seconds": self._seconds()}
-        speed = {
-            "speed/steps_per_second": self._speed(call),
+        speeds = {
+            "speed/steps_per_second": speed.after(call) * self.steps_per_call,
             "speed/seeds_together": float(len(self.recorders)),
         }
-        return [common | name_metrics(own, self._steps_per_iteration) | speed for own in of_runs]
+        return [common | name_metrics(own, self._steps_per_iteration) | speeds for own in of_runs]
 
     def _write(self, state: TrainState, rows: list[Row], progress: Progress) -> None:
         """Log and display the rows of a call. Film the policies whose evaluation has ended."""
@@ -235,25 +252,13 @@ class Trainer:
             for recorder, row, policy in zip(self.recorders, rows, self._program.policies(state), strict=True):
                 if "eval/return" in row:
                     recorder.film(policy, int(row["env_steps"]))
-        progress.update(_mean_row(rows))
+        progress.update(mean_row(rows))
 
     def _warn_of_physics(self, row: Row) -> None:
         for metric, warning in physics_warnings(row, self.steps_per_call).items():
             if metric not in self._warned_of:
                 self._warned_of.add(metric)
                 _log.warning(f"{warning}; the metric {metric} has the count")
-
-    def _speed(self, call: int) -> float:
-        """Steps per second of each run over about `_SPEED_WINDOW` seconds, including evaluation and saving."""
-        now = time.monotonic()
-        while len(self._times) > 1 and now - self._times[1][0] > _SPEED_WINDOW:
-            self._times.popleft()
-        then, call_then = self._times[0]
-        if not self._is_compiled:
-            self._times.clear()  # the speeds of later calls leave compiling out
-            self._is_compiled = True
-        self._times.append((now, call))
-        return (call - call_then) * self.steps_per_call / max(now - then, 1e-9)
 
     def _seconds(self) -> float:
         return self._seconds_before + time.monotonic() - self._started
@@ -290,9 +295,3 @@ class Trainer:
         number = signal.Signals[interrupt.signal_name].value if interrupt.signal_name else 0
         number = self._program.max_over_processes(number)
         return signal.Signals(number).name if number else None
-
-
-def _mean_row(rows: list[Row]) -> Row:
-    """Means over the runs that have a value, for display."""
-    values = {name: [row[name] for row in rows if name in row] for name in {name for row in rows for name in row}}
-    return {name: sum(found) / len(found) for name, found in values.items()}

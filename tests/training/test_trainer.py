@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TINY, TINY_CALL
+from helpers import TINY, TINY_CALL, slow_except
+from jax._src import compiler
 
 import mjx_walk
 from mjx_walk import train as train_command
@@ -49,23 +50,36 @@ def test_nothing_is_compiled_twice():
     for _ in range(3):
         state, metrics = call(state)
     assert traces == after_first and metrics["loss"].value.shape == (2,)
-    assert call._cache_size() == 1
+
+
+@pytest.mark.parametrize("seeds", slow_except(["seed=3"], ["seed=3", "seeds=[3,5]"]))
+def test_each_program_is_compiled_once(seeds, tmp_path, monkeypatch):
+    """What is compiled ahead is what is called, in a new run and in one that resumes."""
+    compiled = []
+    compile_or_get_cached = compiler.compile_or_get_cached
+
+    def note(backend, computation, *arguments, **options):
+        compiled[-1].append(str(computation.operation.attributes["sym_name"]).strip('"'))
+        return compile_or_get_cached(backend, computation, *arguments, **options)
+
+    monkeypatch.setattr(compiler, "compile_or_get_cached", note)
+    for calls, resume in ((1, "false"), (3, "true")):
+        compiled.append([])
+        steps = f"total_steps={calls * TINY_CALL}"
+        train_command.main([*TINY, seeds, f"run_dir={tmp_path / 'run'}", steps, f"resume={resume}"])
+    counts = [[names.count(f"jit_{name}") for name in ("strong", "collect", "learn")] for names in compiled]
+    assert counts == [[1, 1, 1], [0, 1, 1]]
 
 
 def test_a_call_is_logged_before_the_next_begins(tmp_path, monkeypatch):
     """A row's seconds and speed are those of its own call."""
-    events = []
+    events, step = [], programs._TwoPrograms.__call__
 
-    def counted(*args, **kwargs):
-        step = make_step(*args, **kwargs)
+    def begin(self, state):
+        events.append("begins")
+        return step(self, state)
 
-        def begin(state):
-            events.append("begins")
-            return step(state)
-
-        return begin
-
-    monkeypatch.setattr(programs, "make_step", counted)
+    monkeypatch.setattr(programs._TwoPrograms, "__call__", begin)
     overrides = [*TINY, f"run_dir={tmp_path / 'run'}", f"total_steps={3 * TINY_CALL}"]
     mjx_walk.run(overrides, on_metrics=lambda row: events.append("is logged"))
     assert events == 3 * ["begins", "is logged"]
@@ -106,7 +120,7 @@ def test_only_seeds_whose_networks_are_finite_are_saved(tmp_path, monkeypatch):
             value = jax.tree.map(lambda x: x.at[1].set(jnp.inf), state.params.value)
             return state.replace(params=state.params.replace(value=value))
 
-        return break_second
+        return jax.jit(break_second)
 
     monkeypatch.setattr(programs, "make_init", broken)
     with pytest.raises(UserError, match=r"64 steps params\.value\.\S+ of seed 5 is not finite"):
