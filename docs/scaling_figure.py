@@ -7,10 +7,10 @@ from generator.score_tables import read
 
 DOCS = Path(__file__).parent
 SERIES = {
-    "PPO, 16,384 environments on each": ("SP41", "SP42", "SP43"),
-    "PPO, 16,384 in all": ("SP41", "SP44", "SP45"),
-    "csac, 2,048 environments on each": ("SP36", "SP37", "SP38"),
-    "csac, 2,048 in all": ("SP36", "SP39", "SP40"),
+    "PPO, 16,384 environments on each": ("SP47", "SP48", "SP49"),
+    "PPO, 16,384 in all": ("SP47", "SP50", "SP51"),
+    "csac, 2,048 environments on each": ("SP52", "SP53", "SP54"),
+    "csac, 2,048 in all": ("SP52", "SP55", "SP56"),
 }
 """Arms on 1, 2 and 4 GPUs."""
 GPUS = (1, 2, 4)
@@ -31,12 +31,12 @@ def main() -> None:
         style = "-" if number % 2 == 0 else ":"
         axes.plot(GPUS, values, style, color=f"C{number // 2}", marker="o", label=label)
         axes.annotate(
-            f"{values[-1]:.2f}", (GPUS[-1], values[-1]), (6, (-8, -4, 4, -4)[number]), textcoords="offset points"
+            f"{values[-1]:.2f}", (GPUS[-1], values[-1]), (6, (0, -4, -8, -4)[number]), textcoords="offset points"
         )
     axes.set_xticks(GPUS)
     axes.set_yticks(GPUS)
     axes.set_xlim(right=4.4)
-    axes.set_xlabel("H100 GPUs of one host")
+    axes.set_xlabel("H200 GPUs of one host")
     axes.set_ylabel("steps per second, relative to one GPU")
     axes.set_title("Training Humanoid-v5")
     axes.grid(alpha=0.3)
