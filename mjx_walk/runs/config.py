@@ -4,7 +4,6 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -39,14 +38,18 @@ __all__ = [
 ]
 
 
+_registered: dict[tuple[str | None, str], type] = {}
+
+
 def register_schemas() -> None:
     """Register the schema and the groups `env` and `algo` with Hydra."""
-    store = ConfigStore.instance()
-    store.store(name="schema", node=Config)
-    for name, (_, options) in TASKS.items():
-        store.store(group="env", name=name, node=options)
-    for name, (_, settings) in ALGORITHMS.items():
-        store.store(group="algo", name=name, node=settings)
+    nodes: dict[tuple[str | None, str], type] = {(None, "schema"): Config}
+    nodes |= {("env", name): options for name, (_, options) in TASKS.items()}
+    nodes |= {("algo", name): settings for name, (_, settings) in ALGORITHMS.items()}
+    for (group, name), node in nodes.items():
+        if _registered.get((group, name)) is not node:  # Hydra takes a millisecond for each
+            ConfigStore.instance().store(group=group, name=name, node=node)
+            _registered[group, name] = node
 
 
 def load_config(overrides: list[str]) -> Config:
@@ -128,7 +131,7 @@ def flatten(config: Config) -> dict[str, Any]:
             else:
                 yield prefix + key, item
 
-    return dict(walk(yaml.safe_load(OmegaConf.to_yaml(OmegaConf.structured(config))), ""))
+    return dict(walk(OmegaConf.to_container(OmegaConf.structured(config)), ""))
 
 
 def training_command(config: Config) -> str:
