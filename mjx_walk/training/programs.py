@@ -4,7 +4,7 @@ The trainer calls their functions and does not know which of them it runs.
 """
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol
 
@@ -16,8 +16,8 @@ from mjx_walk.algos import Algorithm, TrainState, is_finite
 from mjx_walk.utils.types import Metrics
 
 Step = Callable[[TrainState], tuple[TrainState, Metrics]]
-Lower = Callable[[list[jax.Array]], Iterator[jax.stages.Lowered]]
-"""`keys of the runs → programs`, traced one by one. A later call of a program finds it compiled."""
+Lower = Callable[[list[jax.Array]], list[jax.stages.Lowered]]
+"""`keys of the runs → programs`. Once they are compiled, a call of them does not compile them again."""
 
 
 class Program(NamedTuple):
@@ -28,7 +28,7 @@ class Program(NamedTuple):
     step: Step
     """One call: `state → (state, metrics)`, several iterations. It consumes the state."""
     lower: Lower
-    """The programs of `init` and `step`, for compiling them before they run."""
+    """Traces the program of `init`, and then those of `step`."""
     split: Callable[[TrainState], list[TrainState]]
     """The state of each run, without an axis in front; on the host if there was one."""
     merge: Callable[[list[TrainState]], TrainState]
@@ -59,7 +59,7 @@ class CompiledStep(Protocol):
         """One call."""
         ...
 
-    def lower(self, state: TrainState) -> Iterator[jax.stages.Lowered]:
+    def lower(self, state: TrainState) -> list[jax.stages.Lowered]:
         """Trace the step's programs for a state or its shapes."""
         ...
 
@@ -87,8 +87,8 @@ class _OneProgram:
     def __call__(self, state: TrainState) -> tuple[TrainState, Metrics]:
         return self._call(state)
 
-    def lower(self, state: TrainState) -> Iterator[jax.stages.Lowered]:
-        yield self._call.lower(state)
+    def lower(self, state: TrainState) -> list[jax.stages.Lowered]:
+        return [self._call.lower(state)]
 
 
 class _TwoPrograms:
@@ -104,14 +104,12 @@ class _TwoPrograms:
             rows.append(metrics)
         return state, jax.tree.map(lambda *xs: jnp.stack(xs), *rows)
 
-    def lower(self, state: TrainState) -> Iterator[jax.stages.Lowered]:
-        yield self._collect.lower(state)
-        yield self._learn.lower(*jax.eval_shape(self._collect, state))
+    def lower(self, state: TrainState) -> list[jax.stages.Lowered]:
+        return [self._collect.lower(state), self._learn.lower(*jax.eval_shape(self._collect, state))]
 
 
-def _lower_both(init: jax.stages.Wrapped, step: CompiledStep, keys: jax.Array) -> Iterator[jax.stages.Lowered]:
-    yield init.lower(keys)
-    yield from step.lower(jax.eval_shape(init, keys))
+def _lower_both(init: jax.stages.Wrapped, step: CompiledStep, keys: jax.Array) -> list[jax.stages.Lowered]:
+    return [init.lower(keys), *step.lower(jax.eval_shape(init, keys))]
 
 
 def compile_together(programs: list[jax.stages.Lowered]) -> None:

@@ -207,7 +207,7 @@ class Trainer:
     def _ready_to_call(self, restored: TrainState | None) -> TrainState:
         """Compile the programs while the engine gets ready. Return the state for the next call."""
         with nothing_runs():
-            lowered = list(self._program.lower(self._keys))
+            lowered = self._program.lower(self._keys)
         self._task.engine.preparation.begin()  # not before, since it would slow the tracing down
         compile_together(lowered if restored is None else lowered[1:])  # a restored run does not call `init`
         self._task.engine.preparation.wait()
