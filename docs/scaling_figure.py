@@ -8,9 +8,9 @@ from generator.score_tables import read
 DOCS = Path(__file__).parent
 SERIES = {
     "PPO, 16,384 environments on each": ("SP47", "SP48", "SP49"),
-    "PPO, 16,384 in all": ("SP47", "SP50", "SP51"),
+    "PPO, 16,384 in total": ("SP47", "SP50", "SP51"),
     "csac, 2,048 environments on each": ("SP52", "SP53", "SP54"),
-    "csac, 2,048 in all": ("SP52", "SP55", "SP56"),
+    "csac, 2,048 in total": ("SP52", "SP55", "SP56"),
 }
 """Arms on 1, 2 and 4 GPUs."""
 GPUS = (1, 2, 4)

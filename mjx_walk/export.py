@@ -18,7 +18,7 @@ usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [forma
   policy=best     the policy with the highest evaluation during training; policy=final is the newest one
   out=FILE.onnx   by default RUN_DIR/policy.onnx, or NAME.onnx in the current folder for a policy of the zoo. The model
                   maps `observation`, [N, observation_size], to `action`, [N, action_size] f32, both in Gymnasium's
-                  units. It normalises observations itself.
+                  units. It normalizes observations itself.
   dtype=float64   of `observation`: Gymnasium's observations are float64
   env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
 """

@@ -79,7 +79,7 @@ def _overview(tasks: dict[str, Task]) -> str:
         ("Action size", lambda task: task.action_size),
         ("Time limit, steps", lambda task: f"{task.max_episode_steps:,}"),
         ("Duration of a step, s", lambda task: f"{task.dt:g}"),
-        ("Physics steps of a step", lambda task: task.options.frame_skip),
+        ("Physics steps per step", lambda task: task.options.frame_skip),
         ("Physics time step, s", lambda task: f"{task.model.opt.timestep:g}"),
         ("Integrator", _integrator),
     ]

@@ -13,7 +13,7 @@ _NORMAL = (
     "every velocity"
 )
 _NO_TERMINATION = "Never. Episodes end at the time limit."
-_BY_BODY = "Rows of a body are MuJoCo's `cinert`, `cvel` and `cfrc_ext`, in a frame at the center of mass."
+_BY_BODY = "The rows of each body are MuJoCo's `cinert`, `cvel` and `cfrc_ext`, in a frame at the center of mass."
 _PAID_AT_THE_END = "v4 also pays `{term}` in the step that terminates the episode."
 _ALWAYS_ZERO = (
     "v4 also observes the world body in `cinert`, `cvel` and `cfrc_ext`, and the root joint in `qfrc_actuator`. These "
@@ -99,8 +99,8 @@ TEXTS = {
         },
         termination="When the ant is not healthy, unless `terminate_when_unhealthy=false`. It is healthy while the "
         "height of its root is inside `healthy_z_range`.",
-        observation="Rows of a body are MuJoCo's `cfrc_ext`, in a frame at the center of mass. They are clipped to "
-        "`contact_force_range`.",
+        observation="The rows of each body are MuJoCo's `cfrc_ext`, in a frame at the center of mass. They are clipped "
+        "to `contact_force_range`.",
         v4=(
             _PAID_AT_THE_END.format(term="reward_survive"),
             "v4 neither observes contact forces nor has a contact cost, unless `use_contact_forces=true`. Then "

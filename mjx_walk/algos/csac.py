@@ -1,6 +1,6 @@
 """Categorical soft actor-critic: SAC whose critics learn the distribution of returns by cross-entropy.
 
-Sources: the categorical critic of C51 (Bellemare et al. 2017) in SAC with normalised rewards, as in SimbaV2 (Lee et
+Sources: the categorical critic of C51 (Bellemare et al. 2017) in SAC with normalized rewards, as in SimbaV2 (Lee et
 al. 2025) and FlashSAC. Policy and temperature are Brax's.
 """
 

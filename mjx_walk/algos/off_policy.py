@@ -31,7 +31,7 @@ class Batch(NamedTuple):
     """Transitions to learn from, and the settings that change over a run."""
 
     transitions: Transition
-    """`[N, …]`, see `ReplayBuffer.sample`; observations normalised, actions in `[-1, 1]`."""
+    """`[N, …]`, see `ReplayBuffer.sample`; observations normalized, actions in `[-1, 1]`."""
     reward_scale: jax.Array
     rate_factor: jax.Array | float
     """The factor of the learning rates."""
@@ -57,7 +57,7 @@ class OffPolicyState(TrainState):
 class OffPolicyAlgorithm(Algorithm):
     """Stores steps in a replay and learns from samples of it. Subclasses define networks, losses and updates.
 
-    All observations that a subclass sees are normalised, and all its actions lie in `[-1, 1]`.
+    All observations that a subclass sees are normalized, and all its actions lie in `[-1, 1]`.
 
     Raises:
         UserError: settings that exclude each other.
@@ -249,7 +249,7 @@ class OffPolicyAlgorithm(Algorithm):
             transitions, key = jax.tree.map(lambda x: x[-1], inputs)
             return self.full_update(learner, settings(transitions), key)
 
-        # Sampled and normalised at once: on a GPU, small updates wait for the launch of their kernels.
+        # Sampled and normalized at once: on a GPU, small updates wait for the launch of their kernels.
         sample_key, key = jax.random.split(key)
         num_transitions = self.updates_per_iteration * config.batch_size
         sampled = self.buffer.sample(replay, sample_key, num_transitions, config.n_step, discount)

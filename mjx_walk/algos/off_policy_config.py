@@ -53,11 +53,11 @@ class OffPolicyConfig:
     normalize_rewards: bool = False
     """Divide rewards by the running std of the discounted return, before `reward_scale`."""
     normalized_return_max: float | None = setting(None, above=0, only_if={"normalize_rewards": True})
-    """Upper bound of normalised returns: rewards are divided by more where a return seen so far would exceed it."""
+    """Upper bound of normalized returns: rewards are divided by more where a return seen so far would exceed it."""
     normalize_observations: bool = True
     """Shift and scale observations by their running mean and std."""
     observation_clip: float | None = setting(10.0, above=0)
-    """Bound of normalised observations."""
+    """Bound of normalized observations."""
     policy_hidden_layer_sizes: tuple[int, ...] = setting((256, 256), at_least=1)
     """Widths of the policy's hidden layers."""
     critic_hidden_layer_sizes: tuple[int, ...] = setting((256, 256), at_least=1)

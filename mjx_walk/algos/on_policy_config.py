@@ -52,7 +52,7 @@ class OnPolicyConfig:
     normalize_advantages: bool = True
     """Shift and scale advantages to mean 0 and standard deviation 1."""
     observation_clip: float | None = setting(10.0, above=0)
-    """Bound of normalised observations."""
+    """Bound of normalized observations."""
     policy_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 128), at_least=1)
     """Widths of the policy's hidden layers."""
     value_hidden_layer_sizes: tuple[int, ...] = setting((256, 256, 256, 256), at_least=1)

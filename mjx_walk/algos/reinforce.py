@@ -107,7 +107,7 @@ def linear_fit(obs: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Arra
     control". Deviations: no powers of time, since nothing in these tasks depends on it; fitted to the batch itself.
 
     Args:
-        obs: `[N, T, observation_size]`, unnormalised.
+        obs: `[N, T, observation_size]`, unnormalized.
         target: `[N, T]`, of mean 0.
         weight: `[N, T]`, 0 where a target does not count.
 

@@ -64,7 +64,7 @@ compute_gae = ppo_losses.compute_gae
 
 @dataclasses.dataclass(frozen=True)
 class SACLosses:
-    """Brax's losses of temperature, critics and policy, on transitions whose observations are normalised.
+    """Brax's losses of temperature, critics and policy, on transitions whose observations are normalized.
 
     `temperature(log_alpha, policy, transitions, key)`, `critic(critic, policy, target_critic, alpha, transitions, key)`
     and `policy(policy, critic, alpha, transitions, key)`, each `[] f32`.
@@ -81,7 +81,7 @@ def make_sac_losses(
     """Brax's SAC losses.
 
     Args:
-        nets: policy and critics, which normalise no observations.
+        nets: policy and critics, which normalize no observations.
         reward_scale: factor of the rewards.
         target_entropy: nats per action dimension.
         action_size: number of action dimensions.

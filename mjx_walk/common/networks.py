@@ -82,7 +82,7 @@ class _BoundedNormal(NormalDistribution):
 def make_sac_networks(
     task: Task, config: Any, critics: brax_networks.FeedForwardNetwork | None = None
 ) -> sac_networks.SACNetworks:
-    """Policy and critics of Brax's SAC, for one task, each of its own size, on normalised observations.
+    """Policy and critics of Brax's SAC, for one task, each of its own size, on normalized observations.
 
     Args:
         task: gives the sizes.

@@ -74,7 +74,7 @@ def returns_to_go(
 
 
 class ReturnScale(flax.struct.PyTreeNode):
-    """Running variance and bound of the discounted return, by which rewards may be normalised.
+    """Running variance and bound of the discounted return, by which rewards may be normalized.
 
     Source: `VecNormalize` of Stable-Baselines3 (`r / std(G)`, with `G ← γ G + r` running through each environment).
     """

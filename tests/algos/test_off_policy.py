@@ -78,7 +78,7 @@ def test_learning_rates_follow_their_schedule(schedule, rates):
     np.testing.assert_allclose(metrics["rate"], rates)
 
 
-def test_normalised_rewards_keep_the_largest_return_within_its_bound():
+def test_normalized_rewards_keep_the_largest_return_within_its_bound():
     """A reward of 1 at each step for 10 steps: the largest discounted return is more than the std of all."""
     _, state, metrics = iterate(
         EndlessReward(10), 12, normalize_rewards=True, normalized_return_max=0.5, reward_scale=2.0

@@ -183,7 +183,7 @@ def test_the_values_gradient_is_clipped_to_its_own_norm():
     np.testing.assert_allclose(moments, [0.001 * 0.25**2, 0.001, 0.1 * 0.25, 0.1], rtol=1e-3)
 
 
-def test_the_entropy_bonus_falls_and_rewards_are_normalised_by_what_was_seen_before(monkeypatch):
+def test_the_entropy_bonus_falls_and_rewards_are_normalized_by_what_was_seen_before(monkeypatch):
     """The arguments of Brax's loss, which a fake loss returns as metrics."""
 
     def loss(params, *_, entropy_cost, reward_scaling, **__):

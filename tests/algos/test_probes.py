@@ -41,7 +41,7 @@ SETTINGS = {
         "num_unrolls": 2,
         "num_minibatches": 4,
         "learning_rate": 3e-3,
-        # With normalised advantages a noiseless task never stops to shrink the policy's std.
+        # With normalized advantages a noiseless task never stops to shrink the policy's std.
         "normalize_advantages": False,
         "entropy_coef": 1e-3,
     },
