@@ -2,6 +2,9 @@
 
 import copy
 import pickle
+import shutil
+import subprocess
+import sys
 
 import gymnasium
 import numpy as np
@@ -9,7 +12,7 @@ import pytest
 from gymnasium import wrappers
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import TimeLimit
-from helpers import renders
+from helpers import ENVIRONMENT, renders
 from side_by_side import IDS, REGISTERED, assert_same, make_both, outcome
 
 from mjx_walk.envs import TASKS, make_env
@@ -160,6 +163,27 @@ def test_a_window_needs_a_screen(monkeypatch):
     monkeypatch.setattr("sys.platform", "linux")
     with pytest.raises(UserError, match="render_mode='human' needs a screen; use render_mode='rgb_array'"):
         gymnasium.make("mjx_walk/Walker2d-v5", physics="c", render_mode="human")
+
+
+WINDOW = """
+import glfw, gymnasium, mjx_walk
+env = gymnasium.make("mjx_walk/Walker2d-v5", physics="c", render_mode="human")
+env.reset(seed=0)
+for _ in range(3):
+    env.step(env.action_space.sample())
+window = env.unwrapped.mujoco_renderer.viewer.window
+print(glfw.get_window_attrib(window, glfw.VISIBLE), glfw.get_window_size(window))
+env.close()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("xvfb-run"), reason="there is no virtual screen")
+def test_a_window_opens_on_a_screen():
+    environment = {name: value for name, value in ENVIRONMENT.items() if name != "MUJOCO_GL"}
+    screen = ["xvfb-run", "--auto-servernum", "--server-args=-screen 0 1280x800x24"]
+    done = subprocess.run([*screen, sys.executable, "-c", WINDOW], capture_output=True, text=True, env=environment)
+    assert done.stdout.strip() == "1 (480, 480)", done.stderr
 
 
 def test_a_changed_model_is_not_ignored():
