@@ -124,7 +124,7 @@ def check_model(model: mujoco.MjModel, task: str, needs: ModelNeeds) -> None:
     low, high = model.actuator_ctrlrange.T
     for i in np.flatnonzero(~(np.isfinite(low) & np.isfinite(high) & (low < high))):
         motor = model.actuator(int(i)).name or int(i)
-        raise UserError(f"motor '{motor}' of the model has no range of controls; give it ctrlrange=\"LOW HIGH\"")
+        raise UserError(f"motor '{motor}' of the model has no control range; set its ctrlrange=\"LOW HIGH\"")
 
 
 def check_pose(model: mujoco.MjModel, derived: Iterable[str]) -> None:
@@ -163,7 +163,9 @@ def warn_of_coordinates(model: mujoco.MjModel, task: str, has_x: bool, height: i
     read += [(height, 2, "height")] if height is not None else []
     for index, axis, name in read:
         if not is_coordinate(model, index, axis):
-            _LOGGER.warning("qpos[%d] of this model is not the %s, but %s reads it so, as Gymnasium", index, name, task)
+            _LOGGER.warning(
+                "qpos[%d] of this model is not the %s, but %s reads it as such, as Gymnasium does", index, name, task
+            )
 
 
 def is_coordinate(model: mujoco.MjModel, index: int, axis: int) -> bool:

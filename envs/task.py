@@ -31,7 +31,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     """
 
     GYMNASIUM_NAME: str
-    """Name in Gymnasium's registry, without the version. A class that does not name it has no equal in Gymnasium."""
+    """Name in Gymnasium's registry, without the version. A class without a name has no equivalent in Gymnasium."""
     XML_FILES: dict[str, str]
     """Model file of each version, among Gymnasium's assets."""
     REWARD_TERMS: dict[str, tuple[str, ...]]
@@ -106,7 +106,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         if shaping.shaking and not self._motor_dofs.size:
             raise UserError(f"env.shaping.shaking={shaping.shaking}: no motor drives a joint; set it to 0")
         if shaping.falling and not self.terminates_on_fall:
-            raise UserError(f"env.shaping.falling={shaping.falling}: no fall terminates this {name}; set it to 0")
+            raise UserError(f"env.shaping.falling={shaping.falling}: {name} does not terminate on a fall; set it to 0")
 
     @property
     def is_in_gymnasium(self) -> bool:

@@ -71,7 +71,7 @@ class Run(SavedPolicy):
             episodes: number of episodes.
             backend: `gymnasium`, the real environment, or `sim`, the engine that the run was loaded with. Both score
                 Gymnasium's reward, `sim` with the run's shaping. A run's `reward_function` is not loaded. A task of
-                your own has no equal in Gymnasium: both backends score it in the engine.
+                your own has no equivalent in Gymnasium: both backends score it in the engine.
             seed: seed of the resets.
 
         Raises:
@@ -81,7 +81,7 @@ class Run(SavedPolicy):
         if backend == "gymnasium" and self.task.is_in_gymnasium:
             return score_in_gymnasium(self.task, self.act, episodes, seed)
         if self.reward_function:
-            _LOGGER.warning("scoring Gymnasium's reward: the run's own, %s, is not loaded", self.reward_function)
+            _LOGGER.warning("scoring with Gymnasium's reward: the run's own, %s, is not loaded", self.reward_function)
         return score_in_sim(self.task, self._episodes, episodes, seed)
 
     @functools.cached_property
@@ -114,9 +114,9 @@ def _register_for(folder: RunFolder, task: type[Task]) -> None:
     try:
         name = str(read_yaml(folder.config_copy() or folder.config).env.name)
     except (OSError, ValueError, LookupError, AttributeError, RecursionError, yaml.YAMLError):
-        return  # the loading says what is wrong
+        return  # loading the run reports the error
     if name in BUILT_IN_TASKS:
-        raise UserError(f"{folder.path} trained {name}, a task of this package; leave out task=")
+        raise UserError(f"{folder.path} was trained on {name}, a task of this package; leave out task=")
     register_task(name, task)
 
 

@@ -55,7 +55,7 @@ def main(command_line: list[str]) -> None:
     if arguments.out:
         cli.check_writable(user_path(arguments.out))
     sizes = device_counts(arguments.devices)
-    print("Short trainings in child processes …", flush=True)
+    print("Short training runs in child processes …", flush=True)
     # They run first, before this process allocates the device's memory.
     if sizes:
         results = _print(scaling.measure(overrides, config, sizes, arguments.seconds))

@@ -18,7 +18,7 @@ USAGE = """
 usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [policy=final|best] [episodes=100] [backend=gymnasium|sim] [seed=0]
                                [physics=ENGINE]
 
-  policy=final        the newest policy; the default, except for runs that have kept only the best one, as the zoo has
+  policy=final        the newest policy; the default, except for runs that keep only the best one, such as the zoo's
   policy=best         the policy with the highest evaluation during training
   backend=gymnasium   the real environment, on the CPU; writes eval_gymnasium.json into the run folder
   backend=sim         the run's own engine, or the one given by physics=

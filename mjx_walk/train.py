@@ -48,7 +48,7 @@ usage: python -m mjx_walk.train [env=humanoid] [algo=ppo] [KEY=VALUE ...]
   physics=auto|warp|jax|c   num_envs=N   total_steps=N   seed=N   run_dir=PATH   resume=true
   seeds=N or [3,7]                        train several seeds in one program, each with its own folder
   devices=all or N                        train one run on N GPUs, with one process and num_envs environments each
-  recipe=PATH_BELOW_configs/recipe        use another recipe than the default for the environment and the hardware
+  recipe=PATH_BELOW_configs/recipe        use a recipe other than the default for the environment and the hardware
   env.task=FILE.py:CLASS                  train on a task of your own, see docs/your_own.md
   env.KEY=VALUE                           set one of Gymnasium's keywords, or env.version=v4
   algo.KEY=VALUE                          set an algorithm's setting
@@ -118,7 +118,7 @@ def _train_in_process(overrides: list[str], processes: Processes) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         os._exit(2)
-    except KeyboardInterrupt as stop:  # during scoring, or the second Ctrl-C; messages about the run are out
+    except KeyboardInterrupt as stop:  # during scoring, or the second Ctrl-C; messages are already printed
         sys.stdout.flush()
         os._exit(exit_code(stop.signal_name if isinstance(stop, Stopped) else "SIGINT"))
     except BaseException:

@@ -113,7 +113,7 @@ def test_several_devices_share_what_one_has():
     config = load_config(["algo=td3", "num_envs=32", "algo.batch_size=64", "algo.replay_capacity=1000"])
     assert share_of_total(config, 4) == ["num_envs=8", "algo.batch_size=16", "algo.replay_capacity=250"]
     assert share_of_total(load_config(["algo=ppo", "num_envs=64", "algo.num_minibatches=2"]), 2) == ["num_envs=32"]
-    with pytest.raises(UserError, match="num_envs=32 is no multiple of 3 devices"):
+    with pytest.raises(UserError, match="num_envs=32 cannot be divided evenly among 3 devices"):
         share_of_total(config, 3)
 
 

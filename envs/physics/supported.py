@@ -1,8 +1,8 @@
-"""What an engine does not simulate. A model that has it is refused by the name of the element, before any compilation.
+"""What an engine does not simulate. A model that has it is refused before compilation; the error names the element.
 
 MuJoCo's complete state is `mjSTATE_INTEGRATION`. `PhysicsState` carries position, velocity and the solver's initial
 guess. Mocap bodies and equality flags never change during an episode, so they need not be carried. The rest is refused
-on every engine. MJX leaves out further features without a word; those are refused on its engines.
+on every engine. MJX silently ignores further features; those are refused on its engines.
 """
 
 import logging
@@ -132,13 +132,13 @@ _FEATURES = (
     _Feature(
         _EVERY,
         _named("actuator", lambda m: m.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE),
-        "motors with a state of their own",
+        "actuators with an activation state",
         'set dyntype="none", or use <motor>, <position> or <velocity> without a time constant',
     ),
     _Feature(
         _EVERY,
         _named("actuator", lambda m: _any(m.actuator_history)),
-        "motors with a delay",
+        "actuators with a delay",
         "remove nsample and delay",
     ),
     _Feature(
@@ -157,14 +157,14 @@ _FEATURES = (
     _Feature(
         _MJX,
         _named("actuator", _disabled_motors),
-        "disabled groups of motors",
+        "disabled actuator groups",
         "remove actuatorgroupdisable, or the motor",
     ),
     _Feature(
         _MJX,
         _named("actuator", lambda m: _any(m.actuator_armature)),
-        "the armature of motors",
-        "give the armature to the joint",
+        "actuator armature",
+        "set armature on the joint",
     ),
     _Feature(
         _MJX,
@@ -175,8 +175,8 @@ _FEATURES = (
     _Feature(
         ("jax",),
         _named("actuator", lambda m: _any(m.actuator_damping, m.actuator_dampingpoly)),
-        "the damping of motors",
-        "give the damping to the joint",
+        "actuator damping",
+        "set damping on the joint",
     ),
     _Feature(
         ("jax",),
@@ -205,7 +205,7 @@ _FEATURES = (
     _Feature(
         ("jax",),
         _named("geom", _fluid_geoms),
-        "the fluid forces of single geoms",
+        "the fluid forces of individual geoms",
         "remove fluidshape and fluidcoef",
     ),
     _Feature(

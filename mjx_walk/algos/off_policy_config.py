@@ -11,7 +11,7 @@ class OffPolicyConfig:
     """Settings that all off-policy algorithms have."""
 
     unroll_length: int = setting(4, at_least=1)
-    """Steps of all environments between two phases of learning."""
+    """Steps of each environment between two learning phases. All environments step together."""
     grad_updates_per_step: int = setting(8, at_least=1)
     """Critic updates for each step of all environments. The update-to-data ratio is this divided by `num_envs`."""
     policy_delay: int = setting(1, at_least=1)
@@ -45,7 +45,7 @@ class OffPolicyConfig:
         at_least=1,
         only_if={"learning_rate_schedule": AnyBut("constant"), "final_discount": AnyBut(None)},
     )
-    """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
+    """Environment steps over which schedules run, independent of `total_steps`: stopping early does not change them."""
     max_grad_norm: float | None = setting(None, above=0)
     """Global norm to which gradients are clipped. If unset, they are not."""
     reward_scale: float = setting(1.0, above=0)
@@ -53,7 +53,7 @@ class OffPolicyConfig:
     normalize_rewards: bool = False
     """Divide rewards by the running std of the discounted return, before `reward_scale`."""
     normalized_return_max: float | None = setting(None, above=0, only_if={"normalize_rewards": True})
-    """Upper bound of normalized returns: rewards are divided by more where a return seen so far would exceed it."""
+    """Bound of normalized returns. If a return seen so far would exceed it, rewards are divided by a larger number."""
     normalize_observations: bool = True
     """Shift and scale observations by their running mean and std."""
     observation_clip: float | None = setting(10.0, above=0)

@@ -15,9 +15,9 @@ class OnPolicyConfig:
     num_unrolls: int = setting(4, at_least=1, at_most=2**31 - 1)
     """Unrolls of every environment in one batch."""
     normalizer_warmup_steps_per_env: int = setting(16, at_least=0)
-    """First steps of each environment, whose batches only set the scale of observations and rewards. Ten are too few on
-    Humanoid, which falls after 24 random actions: under the scale of the first ten, the next ten positions are two
-    standard deviations away, and learning starts with a KL of 3 to 13."""
+    """First steps of each environment. Their batches only set the scale of observations and rewards. Ten are too few on
+    Humanoid, which falls after 24 random actions. Under their scale, positions in the next ten steps are two standard
+    deviations from the mean, and learning starts with a KL of 3 to 13."""
     learning_rate: float = setting(3e-4, above=0)
     """Step size of Adam, for policy and value network."""
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
@@ -30,11 +30,12 @@ class OnPolicyConfig:
         at_least=1,
         only_if={"learning_rate_schedule": AnyBut("constant"), "entropy_schedule": AnyBut("constant")},
     )
-    """Environment steps over which schedules run. Fixed, so that stopping early does not change the path."""
+    """Environment steps over which schedules run, independent of `total_steps`: stopping early does not change them."""
     max_policy_grad_norm: float = setting(1.0, above=0)
     """Global norm to which the policy's gradient is clipped."""
     max_value_grad_norm: float | None = setting(None, above=0)
-    """If unset, `max_policy_grad_norm` clips the joint gradient of policy and value, as in Brax."""
+    """Global norm to which the value network's gradient is clipped. If unset, `max_policy_grad_norm` clips the joint
+    gradient of policy and value, as in Brax."""
     discount: float = setting(0.97, at_least=0, at_most=1)
     """Discount factor γ of one step."""
     gae_lambda: float = setting(0.95, at_least=0, at_most=1)

@@ -124,7 +124,7 @@ class ReplayBuffer:
     ) -> Transition:
         """Draw transitions over up to `n_step` steps, uniformly and with replacement.
 
-        Those that began in the newest `n_step` rows wait until the row that they lead to is written.
+        Those that start in the newest `n_step` rows are left out: their next observation may not be written yet.
 
         Args:
             replay: with more than `n_step` rows written.

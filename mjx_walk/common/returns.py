@@ -121,7 +121,7 @@ def update_return_scale(
 
 
 def reward_multiplier(scale: ReturnScale, bound: float | None = None) -> jax.Array:
-    """`1 / std(G)`; with a bound less where that would lift the largest `|G|` above it.
+    """`1 / std(G)`, or less if a bound is given and the largest normalized `|G|` would exceed it.
 
     Source of the bound: SimbaV2 (Lee et al. 2025).
     """

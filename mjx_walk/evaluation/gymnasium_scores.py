@@ -40,7 +40,7 @@ Episodes = Callable[[jax.Array, int], tuple[jax.Array, jax.Array]]
 def score_in_gymnasium(task: Task, act: Callable[[Any], Any], num_episodes: int, seed: int = 0) -> Scores:
     """Score complete episodes in `gymnasium.make`: MuJoCo on the CPU, in float64, with the model's own solver.
 
-    One process per core plays the episodes. A task without an equal in Gymnasium is scored in its own engine.
+    One process per core plays the episodes. A task without an equivalent in Gymnasium is scored in its own engine.
 
     Args:
         task: the environment and its keywords.

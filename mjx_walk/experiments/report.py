@@ -21,7 +21,7 @@ DRAWN = (
 )
 LEGEND = (
     "Scores are mean returns in Gymnasium. The final policy is the newest one. The best policy has the highest "
-    "evaluation during training. For files of older versions, it is the better of both on the scored episodes.\n"
+    "evaluation during training. In files from older versions, it is the better of the two on the scored episodes.\n"
 )
 
 

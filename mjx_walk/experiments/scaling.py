@@ -81,7 +81,7 @@ def share_of_total(config: Config, size: int) -> list[str]:
         totals |= {"algo.batch_size": config.algo.batch_size, "algo.replay_capacity": config.algo.replay_capacity}
     for name in ("num_envs", "algo.batch_size"):
         if totals.get(name, size) % size:
-            raise UserError(f"{name}={totals[name]} is no multiple of {size} devices")
+            raise UserError(f"{name}={totals[name]} cannot be divided evenly among {size} devices")
     return [f"{name}={total // size}" for name, total in totals.items()]
 
 

@@ -99,7 +99,7 @@ _NORMALIZED = (
     "A normalized score is 0 for uniformly random actions and 1 for the highest mean that SLM-Lab 5 has published for "
     "PPO, SAC and CrossQ on the same environment. Mean and IQM (interquartile mean) are taken over the environments, "
     "for each seed that is scored in all of them, and averaged over these seeds. Intervals are Student's 95% intervals "
-    "over these seeds, from three up.\n"
+    "over these seeds, given for three or more.\n"
 )
 
 

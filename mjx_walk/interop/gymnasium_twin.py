@@ -78,7 +78,7 @@ def refuse_changes(model: mujoco.MjModel, original: dict[str, np.ndarray]) -> No
     """
     for name, value in physics_values(model).items():
         if not np.array_equal(value, original[name]):
-            raise UserError(f"the physics does not read your change of model.{name}; use xml_file=PATH instead")
+            raise UserError(f"the physics ignores your change to model.{name}; use xml_file=PATH instead")
 
 
 class MujocoAttributes:

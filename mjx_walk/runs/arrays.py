@@ -164,7 +164,7 @@ def _read_numpy(path: Path, expected: Mapping[str, Any], present_name: Callable[
         for member in archive.infolist():
             name = present_name(member.filename.removesuffix(".npy"))
             if name in arrays:  # ten thousand entries may share the bytes of one
-                raise ValueError(f"{name} is there twice")
+                raise ValueError(f"{name} occurs twice")
             if name in expected:
                 arrays[name] = _read_member(path, archive, member, name, expected[name])
     return arrays
@@ -173,17 +173,17 @@ def _read_numpy(path: Path, expected: Mapping[str, Any], present_name: Callable[
 def _read_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, expected: Any) -> np.ndarray:
     """Read an array of a NumPy archive, after a look at its header."""
     if member.compress_type not in _COMPRESSIONS:
-        raise ValueError(f"{name} is compressed in another way than NumPy does")
+        raise ValueError(f"{name} is compressed in a way that NumPy does not use")
     with archive.open(member) as file:
         if np.lib.format.read_magic(file) != (1, 0):
-            raise ValueError(f"{name} has another version of NumPy's format")
+            raise ValueError(f"{name} uses another version of NumPy's format")
         try:
             shape, _, dtype = np.lib.format.read_array_header_1_0(file)
         except MemoryError as error:  # so Python's parser reports deep nesting
             raise ValueError(f"the header of {name} cannot be read") from error
         _check(path, name, expected, shape, dtype)
         if member.file_size != file.tell() + math.prod(shape) * dtype.itemsize:
-            raise ValueError(f"{name} has another size than its header says")
+            raise ValueError(f"the size of {name} does not match its header")
     with archive.open(member) as file:
         array = np.lib.format.read_array(file, allow_pickle=False)
     return array.view(expected.dtype) if dtype.kind == "V" else array  # NumPy's files do not support bfloat16
@@ -207,7 +207,7 @@ def _read_orbax(path: Path, expected: Mapping[str, Any], present_name: Callable[
             _check(path, name, expected[name], store.shape, store.dtype.numpy_dtype)
             chunk = store.chunk_layout.read_chunk.shape or ()
             if any(size is None or size > max(length, 1) for size, length in zip(chunk, store.shape, strict=True)):
-                raise ValueError(f"{name} has larger pieces than its shape")
+                raise ValueError(f"{name} has chunks larger than its shape")
         reading = {name: store.read() for name, store in stores.items()}
         return {name: np.asarray(future.result()) for name, future in reading.items()}
 

@@ -120,7 +120,7 @@ def read_rows(path: Path) -> list[Row]:
         raise UserError(str(failed_read(path, error))) from error
     if num_invalid:
         more = f" and {num_invalid - 1} more" if num_invalid > 1 else ""
-        warnings.warn(f"line {first_invalid}{more} of {path} cannot be read and is skipped", stacklevel=2)
+        warnings.warn(f"line {first_invalid}{more} of {path} cannot be read; skipped", stacklevel=2)
     return rows
 
 

@@ -65,14 +65,14 @@ def find_saved_task(name: Any, source: Any, config: Path) -> None:
     """
     if isinstance(name, str) and name in BUILT_IN_TASKS:
         if source:
-            raise UserError(f"{config} names code for '{name}', which needs none; remove env.task from it")
+            raise UserError(f"{config} sets env.task for '{name}', a task of this package; remove env.task from it")
         return
     if not isinstance(name, str) or is_registered_from(name, source):  # another type is refused by the schema
         return
     if not source:
         raise UserError(
-            f"the task '{name}' of {config} is not known here; to a command, add {KEY}=FILE.py:CLASS; "
-            f"to load_run, give task=CLASS"
+            f"the task '{name}' of {config} is not registered; add {KEY}=FILE.py:CLASS to the command, or pass "
+            "task=CLASS to load_run"
         )
     require_trusted(source, KEY)
     found = register_task_file(source)

@@ -73,7 +73,7 @@ def locked_folder(folder: RunFolder) -> Iterator[None]:
         try:
             folder.path.mkdir(parents=True, exist_ok=True)
             held.enter_context(
-                locked(folder.lock, f"{folder.path} is in use by another training; wait for it, or stop it")
+                locked(folder.lock, f"{folder.path} is in use by another training run; wait for it, or stop it")
             )
         except OSError as error:
             raise UserError(_CANNOT_WRITE.format(folder.path, error.strerror)) from error

@@ -90,7 +90,7 @@ class Progress:
         self._is_terminal = is_shown and _is_terminal()
         self._bar = _make_bar("compiling", total_steps, done_steps, self._is_terminal)
         if is_shown and not self._is_terminal and done_steps < total_steps:
-            _LOG.info("Compiling the training, which takes from seconds to minutes")
+            _LOG.info("Compiling the training program, which takes seconds to minutes")
         self._is_compiled = False
         self._is_filling = False
         self._steps = done_steps

@@ -61,7 +61,7 @@ class RunFolder:
             try:
                 copy = config_copy(path)
             except ValueError:
-                continue  # who restores the checkpoint says so
+                continue  # restoring the checkpoint reports it
             if copy:
                 return copy
         return None

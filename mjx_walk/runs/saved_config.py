@@ -102,11 +102,11 @@ def _warn_of_edits(trained: Config, present: Config, file: Path, copy: Path) -> 
     """Name the settings of a `config.yaml` that differ from those of the training."""
     edited = differences(trained, present)
     if edited:
-        warnings.warn(f"{file} differs from the checkpoint: {in_short(edited)}; {copy} counts", stacklevel=3)
+        warnings.warn(f"{file} differs from the checkpoint: {in_short(edited)}; {copy} is used", stacklevel=3)
     others = tuple(key for key in flatten(present) if key not in _LENGTHS)
     lengths = differences(trained, present, besides=others)
     if lengths:
-        warnings.warn(f"{file} has another length than the checkpoint: {'; '.join(lengths)}; it counts", stacklevel=3)
+        warnings.warn(f"{file} changes the run's length: {'; '.join(lengths)}; {file.name} is used", stacklevel=3)
 
 
 def _read(path: Path) -> DictConfig:
@@ -125,7 +125,7 @@ def _parse(saved: DictConfig, path: Path) -> Config:
     try:
         find_saved_task(saved.env.name, saved.env.get("task"), path)
         if saved.algo.name not in ALGORITHMS:
-            raise UserError(f"the algorithm '{saved.algo.name}' of {path} is not known here; {_HOW_TO_REGISTER}")
+            raise UserError(f"the algorithm '{saved.algo.name}' of {path} is not registered; {_HOW_TO_REGISTER}")
         schema = OmegaConf.structured(Config(env=TASKS[saved.env.name][1](), algo=ALGORITHMS[saved.algo.name][1]()))
         return to_config(OmegaConf.merge(schema, saved))
     except UserError:

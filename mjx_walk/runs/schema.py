@@ -54,7 +54,7 @@ class Config:
     """Weights & Biases project to log to."""
     profile_calls: int = setting(0, at_least=0)
     """Program calls to record with JAX's profiler, from the third one on, in the run folder's `profile`. TensorBoard
-    and Perfetto show the recording. With Warp on one GPU, record one call: two have hung."""
+    and Perfetto show the recording. With Warp on one GPU, record only one: recording a second call has hung."""
     matmul_precision: str = setting("tensorfloat32", choices=("tensorfloat32", "float32"))
     """Precision of the networks' matrix products. The physics always uses float32."""
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)

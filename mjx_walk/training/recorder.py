@@ -118,9 +118,9 @@ class Recorder:
                 self._filmer.take(policy_params, env_steps)
 
     def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:
-        """Start to save the complete state, and first the final policy, and the best one if it is new.
+        """Start saving the best policy if it is new, then the final policy, then the complete state.
 
-        A state with a replay buffer may take long to save.
+        Saving a state with a replay buffer may take long.
         """
         facts = {
             "env_steps": env_steps,
@@ -235,7 +235,7 @@ class Recorder:
         except OSError as error:
             folder = self._folder.path
             if error.filename == str(folder) or not self._folder.checkpoints.is_dir():
-                raise UserError(f"{folder} has vanished, and with it what was saved; training has stopped") from error
+                raise UserError(f"{folder} has vanished with everything saved in it; training has stopped") from error
             reason = error.strerror or error
             raise UserError(
                 f"cannot write {error.filename or folder}: {reason}; earlier checkpoints are complete; once it can be "

@@ -156,9 +156,9 @@ class Trainer:
         if not self._processes.is_main_process:
             return
         if call >= self.num_calls:
-            _log.info(f"The run has all of its {steps:,} steps already; to train on, give a larger total_steps")
+            _log.info(f"The run has already completed its {steps:,} steps; to continue, give a larger total_steps")
         elif steps != total:
-            _log.info(f"total_steps={total:,} becomes {steps:,}: a call has {self.steps_per_call:,} steps")
+            _log.info(f"total_steps={total:,} is rounded up to {steps:,}: a call has {self.steps_per_call:,} steps")
 
     def score(self) -> None:
         """Score every run in the real Gymnasium with `Recorder.score`, and log the last lines of the training.
@@ -266,7 +266,7 @@ class Trainer:
     def _save(self, state: TrainState, call: int) -> None:
         """Save the TrainState of every run that is finite."""
         if self._are_saved_together:
-            self._wait_for_saves()  # only then is the checkpoint before this one not needed any more
+            self._wait_for_saves()  # until then, the checkpoint before this one may be needed
         states = zip(self.recorders, self._program.split(state), self._program.is_finite(state), strict=True)
         for recorder, own, is_finite in states:
             if is_finite:

@@ -1,4 +1,4 @@
-"""Tools and types that every other room may use: settings, errors, signals, devices, processes, JAX's releases.
+"""Tools and types that every other package may use: settings, errors, signals, devices, processes, JAX's releases.
 
-What knows a task, an algorithm, a run or training belongs in another room.
+Code that depends on tasks, algorithms, runs or training belongs in another package.
 """

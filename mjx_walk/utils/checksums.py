@@ -1,4 +1,4 @@
-"""JSON objects with a checksum, so that a change of a file is noticed, and that strangers may have written."""
+"""JSON objects with a checksum, which reveals a change of the file. The file may come from an untrusted source."""
 
 import json
 import zlib
@@ -11,7 +11,7 @@ __all__ = ["read_json", "take_checksum", "with_checksum"]
 
 _KEY = "checksum"
 _MAX_DEPTH = 20
-"""Deepest nesting that is read. Python writes far less deep objects than it reads."""
+"""Deepest nesting that is read. Python's JSON encoder supports far less nesting than its decoder."""
 
 
 def read_json(path: Path, max_bytes: int) -> Any:

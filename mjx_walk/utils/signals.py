@@ -99,7 +99,7 @@ def _is_ignored_hangup(number: signal.Signals) -> bool:
 
 
 def ignore_at_exit() -> None:
-    """Ignore signals once this process exits: all is done then, and Python would print where it was stopped."""
+    """Ignore signals once this process exits: all work is done then, and Python would print a traceback."""
     atexit.unregister(_ignore)
     atexit.register(_ignore)  # what is registered last runs first
 

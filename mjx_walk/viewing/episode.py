@@ -118,7 +118,7 @@ def record_episode(
 def make_gymnasium(task: Task, **keywords: Any) -> gymnasium.Env:
     """Make the real Gymnasium environment of a task, with further keywords of `gymnasium.make`.
 
-    A task without an equal in Gymnasium runs in its own engine.
+    A task without an equivalent in Gymnasium runs in its own engine.
     """
     if not task.is_in_gymnasium:
         return TaskEnv(task, **keywords)

@@ -22,7 +22,7 @@ FOLDERS = {
     "dm_control": ("dm_control", "suite"),
 }
 EQUAL = "equals Gymnasium"
-STATE = "motors with a state of their own"
+STATE = "actuators with an activation state"
 MODELS = [
     ("Brax humanoid.xml", "humanoid", EQUAL),
     ("Brax ant.xml", "ant", EQUAL),
@@ -113,7 +113,7 @@ def edited(tmp_path, old, new):
 def test_motors_without_a_range_are_refused(tmp_path):
     source = 'ctrllimited="true" ctrlrange="-1.0 1.0" gear="100" joint="leg_joint"'
     path = edited(tmp_path, source, 'gear="100" name="shin" joint="leg_joint"')
-    with pytest.raises(UserError, match="motor 'shin' of the model has no range of controls; give it ctrlrange"):
+    with pytest.raises(UserError, match="motor 'shin' of the model has no control range; set its ctrlrange"):
         make_env("walker2d", physics="c", xml_file=path)
 
 

@@ -139,7 +139,7 @@ def test_a_run_folder_alone_runs_no_code(tmp_path, monkeypatch, capsys):
         assert not (tmp_path / "ran").exists(), command
         assert code == (2 if command == "train" else 0), printed
         if "backend=sim" in arguments:
-            assert "scoring Gymnasium's reward: the run's own" in printed.err
+            assert "scoring with Gymnasium's reward: the run's own" in printed.err
     assert f"to run it, add {named}" in printed.err
     train_here("run", "resume=true", f"total_steps={2 * TINY_CALL}", named, tiny=[])
     assert (tmp_path / "ran").exists()
@@ -170,8 +170,8 @@ def test_invalid_reward_function_is_refused(custom, tmp_path, monkeypatch, funct
         ("walker2d", {"keep_y": 1.0}, "walker2d has no y coordinate; set it to 0"),
         ("hopper", {"keep_y": 1.0}, "hopper has no y coordinate; set it to 0"),
         ("reacher", {"backward": 1.0}, "reacher has no x coordinate; set it to 0"),
-        ("pusher", {"falling": 1.0}, "no fall terminates this pusher; set it to 0"),
-        ("humanoid_standup", {"falling": 1.0}, "no fall terminates this humanoid_standup; set it to 0"),
+        ("pusher", {"falling": 1.0}, "pusher does not terminate on a fall; set it to 0"),
+        ("humanoid_standup", {"falling": 1.0}, "humanoid_standup does not terminate on a fall; set it to 0"),
         ("walker2d", {"faling": 1.0}, "unknown key 'env.shaping.faling'"),
     ],
 )

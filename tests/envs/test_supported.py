@@ -51,9 +51,9 @@ SPHERE = 'type="sphere" size=".05"'
 ALL, MJX, JAX, WARP = ("c", "jax", "warp"), ("jax", "warp"), ("jax",), ("warp",)
 
 REFUSED = {
-    "filter": (ALL, {"motor": GENERAL.format('dyntype="filter" dynprm=".05"')}, "state of their own (motor 'm')"),
-    "integrator": (ALL, {"motor": GENERAL.format('dyntype="integrator"')}, "state of their own (motor 'm')"),
-    "delay": (ALL, {"motor": MOTOR.format('delay=".01" nsample="4"')}, "motors with a delay (motor 'm')"),
+    "filter": (ALL, {"motor": GENERAL.format('dyntype="filter" dynprm=".05"')}, "an activation state (motor 'm')"),
+    "integrator": (ALL, {"motor": GENERAL.format('dyntype="integrator"')}, "an activation state (motor 'm')"),
+    "delay": (ALL, {"motor": MOTOR.format('delay=".01" nsample="4"')}, "actuators with a delay (motor 'm')"),
     "sensor_delay": (
         ALL,
         {"sensor": '<jointpos name="s" joint="knee" delay=".01" nsample="4"/>'},
@@ -64,15 +64,15 @@ REFUSED = {
     "group": (
         MJX,
         {"option": 'actuatorgroupdisable="2"', "motor": MOTOR.format('group="2"')},
-        "disabled groups of motors (motor 'm')",
+        "disabled actuator groups (motor 'm')",
     ),
-    "armature": (MJX, {"motor": MOTOR.format('armature=".2"')}, "the armature of motors (motor 'm')"),
+    "armature": (MJX, {"motor": MOTOR.format('armature=".2"')}, "actuator armature (motor 'm')"),
     "connect": (MJX, {"equality": '<connect name="e" body1="shin" anchor=".3 0 0"/>'}, "(equality constraint 'e')"),
     "weld": (MJX, {"equality": '<weld body1="shin"/>'}, "weld constraints as MuJoCo does (equality constraint 0)"),
     "override": (MJX, {"option": 'o_margin=".02"', "flag": '<flag override="enable"/>'}, "does not support this model"),
     "diagexact": (MJX, {"flag": '<flag diagexact="enable"/>'}, "does not support this model"),
     "autoreset": (WARP, {"flag": '<flag autoreset="disable"/>'}, "does not support this model"),
-    "damping": (JAX, {"motor": MOTOR.format('damping=".2"')}, "the damping of motors (motor 'm')"),
+    "damping": (JAX, {"motor": MOTOR.format('damping=".2"')}, "actuator damping (motor 'm')"),
     "dampingpoly": (JAX, {"knee": 'damping=".1 .2 .05"'}, "stiffness and damping (joint 'knee')"),
     "stiffnesspoly": (JAX, {"knee": 'stiffness="1 5 3"'}, "stiffness and damping (joint 'knee')"),
     "tendonpoly": (JAX, {"tendon": SPATIAL.format('damping="1 .5 .5"')}, "stiffness and damping (tendon 't')"),
@@ -81,7 +81,7 @@ REFUSED = {
     "ellipsoid_fluid": (
         JAX,
         {"option": 'density="500" viscosity=".5"', "shin": 'fluidshape="ellipsoid"'},
-        "the fluid forces of single geoms (geom 'shin')",
+        "the fluid forces of individual geoms (geom 'shin')",
     ),
     "noslip": (JAX, {"option": 'noslip_iterations="5"'}, "the noslip solver (noslip_iterations)"),
     "slidercrank": (

@@ -191,7 +191,7 @@ def test_a_changed_model_is_not_ignored():
     env.unwrapped.model.geom_rgba[:] = 1.0
     env.reset()
     env.unwrapped.model.body_mass[1] *= 2.0
-    with pytest.raises(UserError, match=r"does not read your change of model\.body_mass; use xml_file=PATH"):
+    with pytest.raises(UserError, match=r"ignores your change to model\.body_mass; use xml_file=PATH"):
         env.reset()
 
 

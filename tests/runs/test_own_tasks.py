@@ -104,7 +104,7 @@ def test_a_class_from_python(home, capsys):
     assert run.config.env.name == "lazy_walker" and run.evaluate(episodes=1).env == "lazy_walker on c"
     as_in_a_new_process("lazy_walker")
     line = refused(capsys, "eval", "run=run")
-    assert line.startswith("error: the task 'lazy_walker' of run/config.yaml is not known here; to a command, add env.")
+    assert line.startswith("error: the task 'lazy_walker' of run/config.yaml is not registered; add env.")
     assert mjx_walk.load_run("run", task=LazyWalker).task.observation_size == 17
     (home / "work" / "t.py").write_text(TASK.format(ran="ran").replace("FastWalker", "LazyWalker"))
     as_in_a_new_process("lazy_walker")
@@ -137,6 +137,6 @@ def test_a_file_for_a_task_of_this_package_is_refused(home):
     path = home / "work" / "config.yaml"
     save_config(load_config(["env=walker2d"]), path)
     path.write_text(path.read_text().replace("  task: null", f"  task: {home}/work/t.py:FastWalker"))
-    with pytest.raises(UserError, match="names code for 'walker2d', which needs none"):
+    with pytest.raises(UserError, match=r"sets env\.task for 'walker2d', a task of this package"):
         read_config(path)
     assert not (home / "ran").exists()

@@ -26,7 +26,7 @@ def test_a_second_training_is_refused_until_the_first_has_ended(here):
     for first in (here, again):
         with prepared([first]):
             for config in (again, dataclasses.replace(again, total_steps=10**9)):
-                with pytest.raises(UserError, match="run is in use by another training; wait for it, or stop it"):
+                with pytest.raises(UserError, match="run is in use by another training run; wait for it, or stop it"):
                     prepared([config]).__enter__()
     with pytest.raises(UserError, match="holds a run already"):
         prepared([here]).__enter__()

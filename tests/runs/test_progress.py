@@ -22,7 +22,7 @@ def lines(caplog):
 
 def test_the_time_left_begins_after_compiling_and_the_last_row_is_shown(lines):
     shown = Progress(10_000, 0)
-    assert lines() == ["Compiling the training, which takes from seconds to minutes"]
+    assert lines() == ["Compiling the training program, which takes seconds to minutes"]
     shown.update(row(1_000, 10.0))
     shown.update(row(2_000, 50.0, **{"episode/return": 7.5, "episode/length": 20.0, "eval/return": 12.5}))
     shown.update(row(3_000, 50.0))  # soon after the one before

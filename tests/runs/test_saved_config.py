@@ -38,7 +38,7 @@ def test_an_edited_configuration_is_named_and_the_checkpoint_s_counts(folder, tr
     assert read_saved_config(folder) == trained and not recwarn
     edit(folder.config, "discount: 0.99", "discount: 0.98")
     says = (
-        r"config.yaml differs from the checkpoint: algo.discount \(was 0.99, now 0.98\); .*0128/run_config.yaml counts"
+        r"config.yaml differs from the checkpoint: algo.discount \(was 0.99, now 0.98\); .*0128/run_config.yaml is used"
     )
     with pytest.warns(UserWarning, match=says):
         assert read_saved_config(folder) == trained
@@ -68,5 +68,5 @@ def test_what_may_change_comes_from_the_file_and_a_length_is_named(folder, train
     changed = dataclasses.replace(trained, total_steps=1280, wandb_project="mine", run_dir="elsewhere")
     changed = dataclasses.replace(changed, env=dataclasses.replace(changed.env, xml_file="/new/mine.xml"))
     save_config(changed, folder.config)
-    with pytest.warns(UserWarning, match=r"another length than the checkpoint: total_steps \(was 640, now 1280\)"):
+    with pytest.warns(UserWarning, match=r"changes the run's length: total_steps \(was 640, now 1280\)"):
         assert read_saved_config(folder) == changed

@@ -180,7 +180,7 @@ def test_a_folder_that_vanishes_stops_the_run_and_is_not_made_again(run):
     recorder.begin(0, will_train=True)
     recorder.write(ROW)
     shutil.rmtree(folder.path)
-    says = f"{folder.path} has vanished, and with it what was saved"
+    says = f"{folder.path} has vanished with everything saved in it"
     with pytest.raises(UserError, match=says):
         recorder.write(ROW)
     recorder.save(state, env_steps=4, wall_seconds=1.0)
