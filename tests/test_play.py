@@ -8,7 +8,7 @@ import imageio.v3 as iio
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from helpers import ENVIRONMENT, command, command_here, renders, slow_except
+from helpers import ENVIRONMENT, command, command_here, renders
 
 import mjx_walk
 from mjx_walk.utils.errors import UserError
@@ -124,7 +124,8 @@ def test_a_renderer_is_tried_in_a_process_of_its_own(monkeypatch):
         assert rendering._works.__wrapped__("x") is works
 
 
-@pytest.mark.parametrize("value", slow_except(["foo"], ["foo", "osmesa", ""]))
+@pytest.mark.slow
+@pytest.mark.parametrize("value", ["foo", "osmesa", ""])
 def test_only_rendering_needs_a_working_opengl(value, tmp_path):
     """OSMesa's library is missing on most machines; where it is installed, the film is written."""
     env = ENVIRONMENT | {"MUJOCO_GL": value}
