@@ -71,6 +71,7 @@ def test_it_runs_on_a_cpu(tmp_path):
         for output in cell.get("outputs", []):
             texts[output.output_type].append(output.get("text") or output.data)
     printed = "".join(texts["stream"])
+    assert "Warning" not in printed, printed
     assert "cpu: cpu; physics on the engine 'c'" in printed
     (score,) = re.findall(r"Walker2d-v5: ([\d,.]+) ± [\d,.]+ over 10 episodes", printed)
     assert float(score.replace(",", "")) > 100
