@@ -13,10 +13,13 @@ AS_A_USER = {"XLA_FLAGS": ""}
 SHORTER = {
     "ppo": (),
     "td3": ("total_steps=150000", "algo.schedule_steps=150000"),
+    "a2c": ("total_steps=1000000",),
 }
 
 
-@pytest.mark.parametrize(("env", "algo", "least"), [("inverted_pendulum", "ppo", 950), ("walker2d", "td3", 400)])
+@pytest.mark.parametrize(
+    ("env", "algo", "least"), [("inverted_pendulum", "ppo", 950), ("walker2d", "td3", 400), ("walker2d", "a2c", 800)]
+)
 def test_a_policy_is_good_after_the_cpu_recipe(tmp_path, env, algo, least):
     """The command that a user without a GPU types. After one call, a walker scores about 300 in Gymnasium."""
     arguments = (f"env={env}", f"algo={algo}", *SHORTER[algo], f"run_dir={tmp_path}/run")
