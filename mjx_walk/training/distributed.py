@@ -102,7 +102,8 @@ def make_devices_program(algorithm: Algorithm, processes: Processes, iterations_
         1,
         init=lambda keys: init(keys[0]),
         step=_make_step(algorithm, processes, iterations_per_call),
-        lower=lambda keys: [init.lower(keys[0])],  # the step needs arrays over all devices
+        # The step needs arrays over all devices.
+        lower=lambda keys, restored: [init.lower(keys[0])] if restored is None else [],
         split_metrics=lambda metrics: [_squeeze(jax.device_get(metrics))],
         max_over_processes=lambda number: max(processes.all_gather(number)),
     )

@@ -16,8 +16,8 @@ from mjx_walk.algos import Algorithm, TrainState, is_finite
 from mjx_walk.utils.types import Metrics
 
 Step = Callable[[TrainState], tuple[TrainState, Metrics]]
-Lower = Callable[[list[jax.Array]], list[jax.stages.Lowered]]
-"""`keys of the runs → programs`. Once they are compiled, a call of them does not compile them again."""
+Lower = Callable[[list[jax.Array], TrainState | None], list[jax.stages.Lowered]]
+"""`(keys of the runs, restored state) → programs`. Once they are compiled, a call does not compile them again."""
 
 
 class Program(NamedTuple):
@@ -28,7 +28,7 @@ class Program(NamedTuple):
     step: Step
     """One call: `state → (state, metrics)`, several iterations. It consumes the state."""
     lower: Lower
-    """Traces the program of `init`, and then those of `step`."""
+    """Traces the programs of `step`, and without a restored state also that of `init`."""
     split: Callable[[TrainState], list[TrainState]]
     """The state of each run, without an axis in front; on the host if there was one."""
     merge: Callable[[list[TrainState]], TrainState]
@@ -108,7 +108,11 @@ class _TwoPrograms:
         return [self._collect.lower(state), self._learn.lower(*jax.eval_shape(self._collect, state))]
 
 
-def _lower_both(init: jax.stages.Wrapped, step: CompiledStep, keys: jax.Array) -> list[jax.stages.Lowered]:
+def _lower(
+    init: jax.stages.Wrapped, step: CompiledStep, keys: jax.Array, restored: TrainState | None
+) -> list[jax.stages.Lowered]:
+    if restored is not None:
+        return step.lower(restored)
     return [init.lower(keys), *step.lower(jax.eval_shape(init, keys))]
 
 
@@ -127,7 +131,7 @@ def make_single_program(algorithm: Algorithm, iterations_per_call: int, fused: b
     return Program(
         init=lambda keys: init(keys[0]),
         step=step,
-        lower=lambda keys: _lower_both(init, step, keys[0]),
+        lower=lambda keys, restored: _lower(init, step, keys[0], restored),
         split=lambda state: [state],
         merge=lambda states: states[0],
         policies=lambda state: [algorithm.policy_params(state)],
@@ -146,7 +150,7 @@ def make_seeds_program(algorithm: Algorithm, num_seeds: int, iterations_per_call
         num_seeds,
         init=lambda keys: init(jnp.stack(keys)),
         step=step,
-        lower=lambda keys: _lower_both(init, step, jnp.stack(keys)),
+        lower=lambda keys, restored: _lower(init, step, jnp.stack(keys), restored),
         split_metrics=functools.partial(_split_metrics, num_seeds),
     )
 

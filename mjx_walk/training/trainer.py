@@ -207,9 +207,9 @@ class Trainer:
     def _ready_to_call(self, restored: TrainState | None) -> TrainState:
         """Compile the programs while the engine gets ready. Return the state for the next call."""
         with nothing_runs():
-            lowered = self._program.lower(self._keys)
+            programs = self._program.lower(self._keys, restored)
         self._task.engine.preparation.begin()  # not before, since it would slow the tracing down
-        compile_together(lowered if restored is None else lowered[1:])  # a restored run does not call `init`
+        compile_together(programs)
         self._task.engine.preparation.wait()
         if restored is not None:
             return restored

@@ -50,6 +50,7 @@ def test_nothing_is_compiled_twice():
     for _ in range(3):
         state, metrics = call(state)
     assert traces == after_first and metrics["loss"].value.shape == (2,)
+    assert call._call._cache_size() == 1
 
 
 @pytest.mark.parametrize("seeds", slow_except(["seed=3"], ["seed=3", "seeds=[3,5]"]))
