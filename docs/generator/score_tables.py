@@ -31,11 +31,12 @@ def best() -> str:
 
 def recipes() -> str:
     """Every recipe for a GPU that has been scored."""
-    titles = ("Task", "Algorithm", ">Score", ">Std", ">Lowest seed", ">Seeds", ">Steps (M)")
+    titles = ("Task", "Algorithm", "Policy", ">Score", ">Std", ">Lowest seed", ">Seeds", ">Steps (M)")
     times = (">Seconds", ">Seeds per process", "Time of")
     rows = [
         (
-            *(row["task"], row["algorithm"], *(_number(row[key]) for key in ("score", "std", "lowest_seed"))),
+            *(row["task"], row["algorithm"], row["policy"]),
+            *(_number(row[key]) for key in ("score", "std", "lowest_seed")),
             *(row["seeds"], row["million_steps"], row["seconds"], row["seeds_per_process"], row["time_of"]),
             code(row["command"]),
         )

@@ -17,6 +17,7 @@ from mjx_walk.evaluation.gymnasium_worker import send
 from mjx_walk.runs.progress import ScoringProgress
 from mjx_walk.runs.scores import Scores
 from mjx_walk.utils.settings import setting
+from mjx_walk.utils.signals import undisturbed
 from mjx_walk.utils.subprocesses import start_module
 from mjx_walk.utils.types import PolicyFn
 
@@ -115,6 +116,7 @@ def score_in_sim(task: Task, episodes: Episodes, num_episodes: int, seed: int = 
         num_episodes: N.
         seed: of the starts.
     """
-    returns, lengths = episodes(jax.random.PRNGKey(seed), num_episodes)
+    with undisturbed("finishing the episodes"):
+        returns, lengths = jax.block_until_ready(episodes(jax.random.PRNGKey(seed), num_episodes))
     name = f"{task.gymnasium_id} on {task.engine.name}"
     return Scores(np.asarray(returns, np.float64), np.asarray(lengths, np.int64), [seed], name)

@@ -36,7 +36,7 @@ from mjx_walk.training.speed import Speed
 from mjx_walk.training.summary import end_lines, score_lines
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.signals import Interrupt, postponed
+from mjx_walk.utils.signals import Interrupt, postponed, undisturbed
 from mjx_walk.utils.types import Metrics
 
 _log = logging.getLogger(__name__)
@@ -231,7 +231,8 @@ class Trainer:
     def _mean_return(self, seed: int, policy_params: Any) -> float:
         """Mean return of a policy over as many new episodes as an inline evaluation has."""
         key = jax.random.fold_in(jax.random.PRNGKey(seed), _CLOSING_EVALUATION)
-        return float(self._evaluate(policy_params, key))
+        with undisturbed("finishing the evaluation of the final policy"):
+            return float(self._evaluate(policy_params, key))
 
     def _rows(self, call: int, metrics: Metrics, speed: Speed) -> list[Row]:
         of_runs = self._program.split_metrics(metrics)

@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 
-__all__ = ["Interrupt", "Stopped", "as_by_ctrl_c", "exit_code", "ignore_at_exit", "postponed"]
+__all__ = ["Interrupt", "Stopped", "as_by_ctrl_c", "exit_code", "ignore_at_exit", "postponed", "undisturbed"]
 
 _PROGRESS = logging.getLogger("mjx_walk.progress")
 _NAMES = ("SIGTERM", "SIGUSR1", "SIGHUP")
@@ -79,6 +79,22 @@ def postponed(doing: str) -> Iterator[None]:
         yield
     if received:
         signal.raise_signal(received[0])
+
+
+@contextlib.contextmanager
+def undisturbed(doing: str) -> Iterator[None]:
+    """Context manager for a device program that runs Python callbacks, as Warp's programs do.
+
+    Signals take effect when the block ends: an exception in a callback, or an exit while one runs, crashes the process.
+    Only a second Ctrl-C raises `KeyboardInterrupt` at once.
+
+    Args:
+        doing: what the process does until then, for the message.
+    """
+    with Interrupt(doing) as interrupt:
+        yield
+    if interrupt.signal_name:
+        signal.raise_signal(signal.Signals[interrupt.signal_name])
 
 
 @contextlib.contextmanager

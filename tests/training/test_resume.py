@@ -28,6 +28,7 @@ from helpers import (
 
 from mjx_walk.api import resolve
 from mjx_walk.runs import checkpoint
+from mjx_walk.training import trainer
 from mjx_walk.utils.subprocesses import start_module
 
 
@@ -224,6 +225,22 @@ def test_a_signal_while_a_policy_is_scored_says_how_to_score_it(tmp_path, monkey
     assert [int(path.name) for path in checkpoint.list_steps(tmp_path / "run" / "checkpoints")] == [TINY_CALL]
     monkeypatch.undo()
     assert command_here("eval", f"run={tmp_path / 'run'}", "episodes=2") == 0
+
+
+def test_the_final_evaluation_ends_before_a_signal_takes_effect(tmp_path, monkeypatch, capsys):
+    ended = []
+
+    def evaluate(*arguments):
+        sigterm()
+        ended.append(True)
+        return real(*arguments)
+
+    real = trainer.evaluate
+    monkeypatch.setattr(trainer, "evaluate", evaluate)
+    assert command_here("train", *TINY, f"run_dir={tmp_path / 'run'}", f"total_steps={TINY_CALL}") == 143
+    said = capsys.readouterr().err
+    assert ended and said.endswith("SIGTERM: finishing the evaluation of the final policy\nStopped by SIGTERM.\n")
+    assert (tmp_path / "run" / "checkpoints" / "final").exists()
 
 
 def test_a_save_that_is_cut_short_has_kept_the_best_policy(tmp_path, monkeypatch, capsys):

@@ -8,7 +8,7 @@ import pytest
 from helpers import CLONE
 
 from mjx_walk.utils.console import console
-from mjx_walk.utils.signals import Interrupt, Stopped, as_by_ctrl_c, exit_code, postponed
+from mjx_walk.utils.signals import Interrupt, Stopped, as_by_ctrl_c, exit_code, postponed, undisturbed
 
 
 @pytest.fixture(autouse=True)
@@ -63,6 +63,20 @@ def test_signals_wait_for_what_must_be_finished():
     with pytest.raises(Stopped, match="SIGTERM"):
         finish()
     assert finished
+
+
+@pytest.mark.parametrize(("name", "raised"), [("SIGINT", KeyboardInterrupt), ("SIGTERM", Stopped)])
+def test_a_device_program_ends_before_a_signal_takes_effect(name, raised):
+    ended = []
+
+    def run():
+        with as_by_ctrl_c(), undisturbed("finishing"):
+            signal.raise_signal(getattr(signal, name))
+            ended.append(True)
+
+    with pytest.raises(raised):
+        run()
+    assert ended
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
