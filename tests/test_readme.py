@@ -177,6 +177,8 @@ def test_every_command(line, small_run, tmp_path, monkeypatch):
         arguments = ["draw=true", f"out={small_run.parent}"]
     elif name == "train" and "--cfg" not in arguments:
         arguments += [*sizes(arguments), "total_steps=1", "evaluation.gymnasium_episodes=1"]
+    elif name == "play":
+        arguments += ["width=96", "height=64"]
     elif name == "compare":
         arguments = [argument for argument in arguments if not argument.startswith(("seeds=", "total_steps="))]
         arguments = [re.sub(r"^algos=\[(\w+,\w+).*", r"algos=[\1]", argument) for argument in arguments]
