@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from mjx_walk.envs import Task
 from mjx_walk.envs.inline_evaluation import EvaluationConfig, InlineEvaluation, InlineEvaluator
+from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.envs.vector_env import VectorEnv, VectorState
 from mjx_walk.utils.types import ITERATION_COUNT, PER_DEVICE, RANDOM_KEY, Metrics, PolicyFn, mark_flags
 
@@ -104,6 +105,11 @@ class Algorithm(abc.ABC):
             state.evaluation, self.policy_params(state), state.iterations, env.pool
         )
         return env, evaluation, scores
+
+    def state_shapes(self) -> Any:
+        """Shapes and dtypes of a `TrainState`, without running anything."""
+        with nothing_runs():
+            return jax.eval_shape(self.init, jax.random.PRNGKey(0))
 
     @abc.abstractmethod
     def init(self, key: jax.Array) -> Any:

@@ -71,7 +71,7 @@ class ReplayBuffer:
     @property
     def num_bytes(self) -> int:
         """Bytes of a buffer, full or empty."""
-        return num_bytes(self.init)
+        return num_bytes(jax.eval_shape(self.init))
 
     def init(self) -> Replay:
         """An empty buffer."""

@@ -44,8 +44,9 @@ def reduced_bytes(algorithm: Algorithm, num_devices: int) -> float:
 
 def _learning_inputs(algorithm: Algorithm) -> tuple[Any, Any]:
     """Shapes of the arguments of `learn`."""
+    shapes = algorithm.state_shapes()
     with nothing_runs():
-        return jax.eval_shape(algorithm.collect, jax.eval_shape(algorithm.init, jax.random.PRNGKey(0)))
+        return jax.eval_shape(algorithm.collect, shapes)
 
 
 def _total(jaxpr: core.Jaxpr, cost: Callable[[core.JaxprEqn], float]) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from mjx_walk.algos import Algorithm, TrainState, make_algorithm, without_replay
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.inline_evaluation import NO_RETURN
-from mjx_walk.envs.physics import nothing_runs, resolve_engine
+from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config
 from mjx_walk.runs.run_folder import RunFolder
@@ -148,8 +148,7 @@ def default_policy(folder: RunFolder) -> str:
 
 def _load(folder: RunFolder, name: str, algorithm: Algorithm) -> tuple[Any, dict[str, Any]]:
     """A policy that a run has kept; if it is damaged, the one in the newest checkpoint that is complete."""
-    with nothing_runs():
-        state = jax.eval_shape(algorithm.init, jax.random.PRNGKey(0))
+    state = algorithm.state_shapes()
     try:
         return load_policy(folder, name, jax.eval_shape(algorithm.policy_params, state))
     except UserError as error:

@@ -40,6 +40,6 @@ def announce(config: Config, folders: list[RunFolder], num_devices: int) -> None
             config.total_steps,
         )
     if config.physics == "warp":
-        _LOGGER.info("On the first run on a machine, Warp compiles its kernels, which takes about a minute.")
+        _LOGGER.info("On the first run on a machine, Warp compiles its kernels, which takes half a minute or more.")
         if config.profile_calls > 1 and num_devices == 1:
             _LOGGER.warning("JAX's profiler has hung in a second recorded call of Warp on one GPU; use profile_calls=1")

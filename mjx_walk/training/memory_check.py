@@ -3,10 +3,7 @@
 import shutil
 from pathlib import Path
 
-import jax
-
 from mjx_walk.algos import Algorithm
-from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.utils.devices import device_memory, num_bytes
 from mjx_walk.utils.errors import UserError
 
@@ -31,8 +28,7 @@ def check_replay(algorithm: Algorithm, run_dir: Path, num_runs: int = 1) -> str 
     if not algorithm.replay_bytes:
         return None
     replay_bytes = num_runs * algorithm.replay_bytes
-    with nothing_runs():
-        checkpoint_bytes = num_runs * num_bytes(algorithm.init, jax.random.PRNGKey(0))
+    checkpoint_bytes = num_runs * num_bytes(algorithm.state_shapes())
     replay, disk = f"{replay_bytes / 1e9:,.2f} GB", f"{2 * checkpoint_bytes / 1e9:,.2f} GB"
     memory = device_memory()
     if replay_bytes > _USABLE * memory:

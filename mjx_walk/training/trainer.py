@@ -26,7 +26,6 @@ from mjx_walk.training.distributed import Processes, make_devices_program, per_d
 from mjx_walk.training.programs import (
     Program,
     compile_together,
-    make_init,
     make_seeds_program,
     make_single_program,
 )
@@ -197,9 +196,7 @@ class Trainer:
                 if self.config.resume and folder.metrics.exists():
                     warnings.warn(f"{folder.path} has no checkpoint; training restarts from step 0", stacklevel=2)
             return None, 0
-        with nothing_runs():
-            like = jax.eval_shape(make_init(self._algorithm.init), self._keys[0])
-        restored = restore_together(self.recorders, like)
+        restored = restore_together(self.recorders, self._algorithm.state_shapes())
         self._seconds_before = max(facts["wall_seconds"] for _, facts in restored)
         calls = restored[0][1]["env_steps"] // self.steps_per_call
         return self._program.merge([state for state, _ in restored]), calls

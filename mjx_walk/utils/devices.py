@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -37,9 +36,9 @@ def only_device(device: int) -> dict[str, str]:
     return {"CUDA_VISIBLE_DEVICES": visible[device] if visible else str(device)}
 
 
-def num_bytes(make: Callable[..., Any], *args: Any) -> int:
-    """Bytes of the pytree that `make(*args)` returns, without running it."""
-    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(make, *args)))
+def num_bytes(tree: Any) -> int:
+    """Bytes of a pytree of arrays or of their shapes and dtypes."""
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
 def device_memory() -> int:
