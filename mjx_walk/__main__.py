@@ -6,6 +6,7 @@ import importlib
 import sys
 from pathlib import Path
 
+from mjx_walk.utils.console import console
 from mjx_walk.utils.versions import __version__
 
 COMMANDS = ("train", "eval", "play", "plots", "export", "zoo", "compare", "bench", "parity")
@@ -34,23 +35,29 @@ _OTHER_NAMES = {
 def main() -> int:
     """Run the command that the arguments name, and return the exit code. Without one, list the commands."""
     command, *arguments = sys.argv[1:] or ["--help"]
+    if command not in COMMANDS:
+        with console():
+            return _without_command(command)
+    from mjx_walk.utils import cli  # imports JAX, which the list of commands does not need
+
+    module = importlib.import_module(f"mjx_walk.{_module(command)}")
+    sys.argv = [f"mjx-walk {command}", *arguments]
+    cli.main(module.main)
+
+
+def _without_command(command: str) -> int:
+    """Show the list of commands or the version, or say what is wrong."""
     if command in ("-h", "--help", "help"):
         print(usage())
         return 0
     if command == "--version":
         print(f"mjx_walk {__version__}")
         return 0
-    if command not in COMMANDS:
-        meant = _meant(command)
-        first = "the command comes first; " if command.startswith("-") else ""
-        hint = f"did you mean: {meant}?" if meant else f"{first}choose one of: {', '.join(COMMANDS)}"
-        print(f"error: unknown command '{command}'; {hint}", file=sys.stderr)
-        return 2
-    from mjx_walk.utils import cli  # imports JAX, which the list of commands does not need
-
-    module = importlib.import_module(f"mjx_walk.{_module(command)}")
-    sys.argv = [f"mjx-walk {command}", *arguments]
-    cli.main(module.main)
+    meant = _meant(command)
+    first = "the command comes first; " if command.startswith("-") else ""
+    hint = f"did you mean: {meant}?" if meant else f"{first}choose one of: {', '.join(COMMANDS)}"
+    print(f"error: unknown command '{command}'; {hint}", file=sys.stderr)
+    return 2
 
 
 def _meant(argument: str) -> str:

@@ -34,7 +34,7 @@ from mjx_walk.training.distributed import Processes, join_processes
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import user_path
-from mjx_walk.utils.settings import describe, refuse_ineffective
+from mjx_walk.utils.settings import describe, meanings, refuse_ineffective, table
 from mjx_walk.utils.signals import Stopped, exit_code
 
 _NAMES = textwrap.fill(
@@ -105,10 +105,15 @@ def _help(arguments: list[str]) -> str:
         return USAGE.strip()
     if given[-1] not in ALGORITHMS:
         raise UserError(f"unknown algo '{given[-1]}'; choose one of: {', '.join(ALGORITHMS)}")
-    lines = describe(ALGORITHMS[given[-1]][1], "algo.")
+    schema = ALGORITHMS[given[-1]][1]
+    meaning, indent = meanings(schema), " " * 6
+    lines = []
+    for row, line in zip(table(schema), describe(schema, "algo."), strict=True):
+        text = meaning.get(row.name, "")
+        lines += [f"  {line}", *textwrap.wrap(text, 112, initial_indent=indent, subsequent_indent=indent)]
     title = f"Settings of {given[-1]}, with their defaults. Recipes change some of them."
     note = "A setting that you give and that has no effect is refused."
-    return "\n".join([USAGE.strip(), "", title, note, "", *(f"  {line}" for line in lines)])
+    return "\n".join([USAGE.strip(), "", title, note, "", *lines])
 
 
 def _train_in_process(overrides: list[str], processes: Processes) -> int:

@@ -1,5 +1,6 @@
 """`mjx-walk`: the list of commands, and each of them."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -37,6 +38,16 @@ def test_the_list_has_every_command_with_its_example_and_what_it_does(monkeypatc
 def test_the_list_needs_no_jax():
     code = "import sys; from mjx_walk.__main__ import usage; usage(); sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("argument", ["--help", "--version", "trai"])
+def test_a_reader_that_ends_early_gets_no_traceback(argument):
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as output:
+        line = [sys.executable, "-m", "mjx_walk", argument]
+        done = subprocess.run(line, env=ENVIRONMENT, stdout=output, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == (2 if argument == "trai" else 0) and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("arguments", [["--version"], ["train", "--version"], ["zoo", "--version"]])

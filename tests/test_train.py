@@ -12,8 +12,10 @@ from tensorboardX.proto.event_pb2 import Event
 
 import mjx_walk
 from mjx_walk import train as train_command
+from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import make_env
 from mjx_walk.training import trainer
+from mjx_walk.utils import settings
 
 
 @pytest.fixture(scope="module")
@@ -177,6 +179,15 @@ def test_an_asset_of_gymnasium_s_is_a_model():
 def test_configuration_can_be_printed(capsys):
     assert train_command.main(["--help"]) == 0
     assert "usage: python -m mjx_walk.train" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_help_says_what_the_settings_of_an_algorithm_mean(algo, capsys):
+    assert train_command.main(["--help", f"algo={algo}"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    schema = ALGORITHMS[algo][1]
+    for row in settings.table(schema):
+        assert f"algo.{row.name}=" in shown and settings.meanings(schema)[row.name] in shown
 
 
 @pytest.mark.parametrize("arguments", [["env=walker2d", "--cfg", "job"], ["algo=sac", "--cfg", "job", "env=walker2d"]])

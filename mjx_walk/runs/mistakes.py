@@ -145,7 +145,8 @@ def _unknown_choice(group: str, value: str, env: str, algo: str) -> str:
     if group == "hardware":
         return f"hardware={value}: choose one of: cpu, gpu"
     own = [name for name in recipe_names() if name.endswith(f"/{env}_{algo}")]
-    near = _near_recipes(value, own) or near_misses(value, recipe_names())
+    nearest = near_misses(value, recipe_names())
+    near = nearest if nearest and nearest[0] not in own else _near_recipes(value, own)
     hint = f"did you mean: {', '.join(near)}?" if near else fitting_recipes(env, algo)
     return f"unknown recipe '{value}'; {hint}"
 
