@@ -54,7 +54,7 @@ usage: python -m mjx_walk.train [env=humanoid] [algo=ppo] [KEY=VALUE ...]
   algo.KEY=VALUE                          set an algorithm's setting
   -m seed=0,1,2                           run a Hydra sweep; Hydra's launchers work
   --cfg job                               print the configuration and exit
-  algo=NAME --help                        also list the settings of the algorithm, with ranges and conditions
+  algo=NAME --help                        also list the settings of the algorithm, with ranges and meanings
 """
 
 _HYDRAS_FLAGS_WITH_VALUE = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--experimental-rerun")

@@ -138,8 +138,8 @@ def test_reduced_data_are_counted():
     """The gradient of one layer, in each of two updates; a mean of one number."""
 
     class OneLayer:
-        def init(self, key):
-            return jnp.zeros((3, 5))
+        def state_shapes(self):
+            return jax.ShapeDtypeStruct((3, 5), jnp.float32)
 
         def collect(self, state):
             return state, jnp.zeros((7, 3))
