@@ -1,8 +1,8 @@
 """Step Warp's physics on two devices from one process: `python docs/multi_gpu_repro.py PROGRAM [GRAPH_MODE]`.
 
 Prints three lines: compiled, checked against the reference, and environment steps per second. The reference comes from
-a CPU: run `JAX_PLATFORMS=cpu NUM_STEPS=1 python docs/multi_gpu_repro.py one` first. `UNUSED=drop` is meant to avoid
-the crash of `shard_map` and `pmap`; `docs/multi_gpu.md` says why.
+a CPU: run `JAX_PLATFORMS=cpu NUM_STEPS=1 python docs/multi_gpu_repro.py one` first. `UNUSED=drop` avoids the
+crash of `shard_map` and `pmap`; `docs/multi_gpu.md` says why.
 """
 
 import concurrent.futures
