@@ -60,6 +60,15 @@ def test_ids_and_measures_are_unique():
     assert [key for key, count in counts.items() if count > 1] == []
 
 
+def test_an_id_stands_for_one_task_and_algorithm():
+    """Also where an arm's seeds and measures have rows of their own."""
+    named = {}
+    for row in ROWS:
+        arm = re.split(r"[.@]", row["id"])[0]
+        named.setdefault(arm, set()).add((row["task"], row["version"], row["algorithm"]))
+    assert {arm: tasks for arm, tasks in named.items() if len(tasks) > 1} == {}
+
+
 def test_measures_and_verdicts_are_listed_here_and_on_the_page():
     assert {row["measure"] for row in ROWS} == MEASURES
     assert {row["verdict"] for row in ROWS} == VERDICTS
