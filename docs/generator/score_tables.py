@@ -15,12 +15,13 @@ _SUITE = re.compile(r"MS\d+")
 
 def best() -> str:
     """For each task the algorithm with the highest score, next to what others have published."""
-    titles = ("Task", "Algorithm", ">Score", ">Std", ">Seeds", ">Minutes")
+    titles = ("Task", "Algorithm", ">Score", ">Std", ">Seeds", ">Steps (M)", ">Minutes")
     published = (">Highest published (v5)", ">Highest published (v4)")
     rows = [
         (
             *(row["task"], row["algorithm"], _number(row["score"]), _number(row["std"]), row["seeds"]),
-            *(f"{float(row['seconds']) / 60:.1f}", _number(row["published_v5"]), _number(row["published_v4"])),
+            *(row["million_steps"], f"{float(row['seconds']) / 60:.1f}"),
+            *(_number(row["published_v5"]), _number(row["published_v4"])),
             code(row["command"]),
         )
         for row in read("results.csv")
