@@ -24,6 +24,9 @@ RECIPES = sorted(
 )
 ALL_RECIPES = recipe_names()
 
+LONGER_SCHEDULES = {"cpu/humanoid_ppo": 3_000_000}
+"""Of the recipes that end before their schedule. All others anneal to the end."""
+
 SCHEDULES = ("learning_rate_schedule", "entropy_schedule", "final_discount", "final_target_entropy")
 
 
@@ -44,7 +47,7 @@ def test_every_recipe_fits(recipe):
     config = load_recipe(recipe)
     assert (config.env.name, config.algo.name, config.hardware) == (env, algo, hardware)
     if any(getattr(config.algo, name, None) not in (None, "constant") for name in SCHEDULES):
-        assert config.algo.schedule_steps == config.total_steps  # annealed to the end, unless it is stopped early
+        assert config.algo.schedule_steps == LONGER_SCHEDULES.get(recipe, config.total_steps)
     algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
     assert algorithm.steps_per_iteration * config.iterations_per_call < config.total_steps / 20
 
