@@ -15,7 +15,7 @@ import matplotlib.figure
 
 
 def plant(fault: str) -> None:
-    """Break the tree that is imported in this process."""
+    """Break the tree that is imported in this process, but not in the processes of several devices, which it starts."""
     if fault == "keys":
         split = jax.random.split
 
