@@ -50,13 +50,13 @@ def of_algorithm(name: str) -> str:
     """The recipes of one algorithm, with the cells that a reader compares."""
     rows = [
         (
-            *(row["task"], row["algorithm"], _number(row["score"]), _number(row["std"]), row["seeds"]),
+            *(row["task"], row["algorithm"], row["policy"], _number(row["score"]), _number(row["std"]), row["seeds"]),
             *(row["million_steps"], code(row["command"])),
         )
         for row in read("results.csv")
         if re.match(rf"{name}\b", row["algorithm"], flags=re.IGNORECASE)
     ]
-    return table(("Task", "Algorithm", ">Score", ">Std", ">Seeds", ">Steps (M)", "Command"), rows)
+    return table(("Task", "Algorithm", "Policy", ">Score", ">Std", ">Seeds", ">Steps (M)", "Command"), rows)
 
 
 def suite() -> str:
