@@ -26,8 +26,8 @@ REFERENCE = "9c96b95"
 """Rebased by a commit that changes bits on purpose, and says which operation."""
 TREE = Path(__file__).resolve().parents[2]
 _NOT_COMPARED = ("wall_seconds", "speed/")
-_OF_FIRST_EVALUATION = ("evaluation.best_policy_params.", "evaluation.best_return")
-"""On several devices, the first evaluation of the reference scores another key's policy."""
+_OF_FIRST_EVALUATION = ("eval/", "evaluation.best_policy_params.", "evaluation.best_return")
+"""Metrics and leaves. On several devices, the first evaluation of the reference scores another key's policy."""
 _QUICK_COMPILE = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
 _SAFE_REDUCTIONS = "--xla_cpu_experimental_ynn_fusion_type=-reduce"
 
@@ -122,7 +122,7 @@ def differences(case: Case, reference: Path, present: Path) -> list[str]:
             found.append(f"{place}: {len(unequal)} of {len(shared)} leaves differ, first {unequal[0]}")
     for path in sorted(reference.rglob("metrics.jsonl")):
         place = path.relative_to(reference)
-        omitted = (*_NOT_COMPARED, "eval/") if case.num_devices > 1 else _NOT_COMPARED
+        omitted = (*_NOT_COMPARED, *(_OF_FIRST_EVALUATION if case.num_devices > 1 else ()))
         theirs, mine = _rows(path, omitted), _rows(present / place, omitted)
         # Metrics that the reference does not log are new.
         shared = [{name: row.get(name) for name in old} for row, old in zip(mine, theirs, strict=False)]
