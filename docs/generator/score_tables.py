@@ -38,7 +38,7 @@ def recipes() -> str:
         (
             *(row["task"], row["algorithm"], row["policy"]),
             *(_number(row[key]) for key in ("score", "std", "lowest_seed")),
-            *(row["seeds"], row["million_steps"], row["seconds"], row["seeds_per_process"], row["time_of"]),
+            *(row["seeds"], row["million_steps"], _number(row["seconds"]), row["seeds_per_process"], row["time_of"]),
             code(row["command"]),
         )
         for row in read("results.csv")
