@@ -29,7 +29,8 @@ _ON_POLICY = (
 )
 _OFF_POLICY = (
     *("algo.updates_per_step=1", "algo.batch_size=8", "algo.replay_capacity=64", "algo.prefill_steps=8"),
-    *("algo.critic_hidden_layer_sizes=[4]", "algo.normalize_rewards=true", "algo.return_bound=3"),
+    *("algo.normalize_rewards=true", "algo.return_bound=3"),
+    "algo.critic_hidden_layer_sizes=[16]",  # the layer norm of 4 units magnifies the rounding of other CPUs 100 times
     "algo.network_dtype=float32",  # the recipes' bfloat16 rounds differently on other machines
 )
 _OWN = {
