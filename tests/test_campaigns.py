@@ -1,7 +1,6 @@
 """Campaigns of minutes, run by CI after the fast tests."""
 
 import json
-import os
 
 import pytest
 from helpers import command
@@ -38,9 +37,6 @@ def test_parity_where_new_memory_holds_no_zeros():
     assert "0 not finite" in done.stdout
 
 
-QUICK_TO_RUN = {"XLA_FLAGS": os.environ["XLA_FLAGS"].replace("optimization_level=0", "optimization_level=1")}
-"""For a program of the `jax` engine, which runs for minutes at `conftest`'s level."""
-
 OWN = {
     "ppo": ("algo.num_minibatches=4", "algo.num_epochs=2"),
     "sac": ("algo.grad_updates_per_step=1", "algo.batch_size=64", "algo.learning_starts=256", "iterations_per_call=1"),
@@ -52,8 +48,7 @@ def test_humanoid_trains_through_mjx(tmp_path, algo, physics):
     """A small batch, from the command to the score, on each MJX engine."""
     small = ("num_envs=16", "evaluation.num_envs=2", "total_steps=1024", "algo.unroll_length=16")
     ends = ("env.max_episode_steps=50", "evaluation.gymnasium_episodes=4", f"run_dir={tmp_path}/run")
-    env = QUICK_TO_RUN if physics == "jax" else {}
-    done = command("train", f"algo={algo}", f"physics={physics}", *small, *ends, *OWN[algo], env=env)
+    done = command("train", f"algo={algo}", f"physics={physics}", *small, *ends, *OWN[algo])
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert len(rows) == 4 and all(row["physics/nonfinite"] == row["physics/overflow"] == 0 for row in rows)

@@ -149,16 +149,16 @@ def sizes(arguments):
     of_the_command = ("-", "hydra.", "seeds=", "devices=")
     first_job = [re.sub(r",.*", "", argument) for argument in arguments if not argument.startswith(of_the_command)]
     config = load_config([*first_job, "run_dir=null"])
-    given = {argument.split("=")[0] for argument in arguments}
     have = {f"algo.{field.name}" for field in dataclasses.fields(config.algo)} | {"num_envs", "evaluation.num_envs"}
+    given = {argument.split("=")[0] for argument in arguments}
     # REINFORCE learns from short unrolls only with a large tail.
     on_policy = (*TINY, "algo.max_tail_discount=0.95")
     tiny = on_policy if isinstance(config.algo, OnPolicyConfig) else TINY_OFF_POLICY
     return [setting for setting in tiny if setting.split("=")[0] in have - given]
 
 
-IN_A_PROCESS = (r"train -m ", r"train .*(devices|seeds)=", r"play ", r"compare env=")
-"""Commands that run as a user would run them; the others run in this process, which has the imports already."""
+OWN_PROCESS = (r"train -m ", r"train .*(devices|seeds)=", r"play ", r"compare env=")
+"""Commands that run in a process of their own. The tests' process, which runs the others, has the imports already."""
 
 
 def smaller(line):
@@ -195,7 +195,7 @@ def test_every_command(line, small_run, tmp_path, monkeypatch, capfd):
     elif name == "compare":
         arguments = [argument for argument in arguments if not argument.startswith(("seeds=", "total_steps="))]
         arguments += ["seeds=1", "total_steps=1", "evaluation.gymnasium_episodes=1"]
-    if any(re.match(pattern, line) for pattern in IN_A_PROCESS):
+    if any(re.match(pattern, line) for pattern in OWN_PROCESS):
         done = command(name, *arguments, timeout=900)
         assert done.returncode == 0, f"{name} {shlex.join(arguments)}\n{done.stdout}\n{done.stderr}"
         return

@@ -31,8 +31,8 @@ from mjx_walk.runs import checkpoint
 from mjx_walk.training import trainer
 from mjx_walk.utils.subprocesses import start_module
 
-TASK = {"c": "env=walker2d", "jax": "env=inverted_pendulum", "warp": "env=inverted_pendulum"}
-"""Without contacts, MJX compiles in a fraction of the time."""
+TASK = {"c": "env=walker2d", "jax": "env=inverted_pendulum", "warp": "env=walker2d"}
+"""Without contacts, the `jax` engine compiles in a fraction of the time."""
 
 
 @pytest.fixture(scope="module")
