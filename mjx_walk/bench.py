@@ -15,6 +15,7 @@ from mjx_walk.runs.overrides import key_of_value
 from mjx_walk.runs.policies import make_task
 from mjx_walk.training import launcher
 from mjx_walk.utils import cli
+from mjx_walk.utils.devices import default_device
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import user_path, write_text
 from mjx_walk.utils.settings import setting
@@ -62,7 +63,7 @@ def main(command_line: list[str]) -> None:
     else:
         results = _print(timing.measure_first_calls(overrides))
     task = make_task(config)
-    device = f"{jax.devices()[0].device_kind}, physics={task.engine.name}, {config.num_envs} environments"
+    device = f"{default_device().device_kind}, physics={task.engine.name}, {config.num_envs} environments"
     print(f"{task.gymnasium_id} on {device}", flush=True)
     if not sizes:
         results |= _print(profile.measure(config, task, arguments.seconds))

@@ -4,12 +4,11 @@ import dataclasses
 import sys
 import warnings
 
-import jax
-
 from mjx_walk.envs import TASKS, make_env
 from mjx_walk.evaluation.parity import check
 from mjx_walk.evaluation.random_steps import take_random_steps
 from mjx_walk.utils import cli
+from mjx_walk.utils.devices import default_device
 from mjx_walk.utils.settings import setting
 
 USAGE = """
@@ -51,7 +50,7 @@ def _single_steps(name: str, arguments: Arguments) -> bool:
     """Print the table of one task. Returns whether every error is within its tolerance."""
     version, physics = arguments.version, arguments.physics
     parity = check(name, version, physics, arguments.num_envs or 32, arguments.steps, arguments.seed)
-    print(f"{name} {version}, {physics} on {jax.devices()[0].device_kind}: {parity.num_steps} steps")
+    print(f"{name} {version}, {physics} on {default_device().device_kind}: {parity.num_steps} steps")
     print(*parity.errors, sep="\n")
     print(
         f"  {parity.num_terminations} terminations, {parity.termination_mismatches} mismatches; "
@@ -65,7 +64,7 @@ def _random_steps(name: str, arguments: Arguments) -> bool:
     """Print the counts of one task. Returns whether no step overflowed or broke."""
     task = make_env(name, physics=arguments.physics, version=arguments.version)
     taken = take_random_steps(task, arguments.num_envs or 4096, arguments.random_steps, arguments.seed)
-    where = f"{name} {arguments.version}, {arguments.physics} on {jax.devices()[0].device_kind}"
+    where = f"{name} {arguments.version}, {arguments.physics} on {default_device().device_kind}"
     counts = f"{taken.num_steps:,} steps, {taken.overflows} overflows, {taken.nonfinite} not finite"
     print(f"{where}: {counts}", flush=True)
     return not (taken.overflows or taken.nonfinite)

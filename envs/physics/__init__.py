@@ -6,12 +6,12 @@ Observations, rewards and episodes do not.
 
 import importlib.util
 
-import jax
 import mujoco
 
 from mjx_walk.envs.physics.base import Derived, Engine, PhysicsState
 from mjx_walk.envs.physics.preparation import nothing_runs
 from mjx_walk.envs.physics.supported import refuse_unsupported, unsupported_by_mjx, warn_of_approximations
+from mjx_walk.utils.devices import default_device
 from mjx_walk.utils.errors import UserError
 
 ENGINES = ("warp", "jax", "c")
@@ -29,7 +29,7 @@ def resolve_engine(name: str) -> str:
     Raises:
         UserError: an unknown name, `warp` without Warp installed, or `c` on an accelerator.
     """
-    device = jax.config.jax_default_device or jax.devices()[0]  # type: ignore[attr-defined]
+    device = default_device()
     platform = device.platform
     has_warp = importlib.util.find_spec("warp") is not None
     if name == "auto":

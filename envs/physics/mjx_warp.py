@@ -19,6 +19,7 @@ from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.mjx_model import check_derived, read_derived, with_newton_solver
 from mjx_walk.envs.physics.preparation import Preparation
 from mjx_walk.envs.physics.warp_kernels import load_kernels
+from mjx_walk.utils.devices import default_device
 
 CONTACTS_PER_ENV = 40
 """Mean capacity per environment for candidate geom pairs, and for contacts. The batch shares both buffers.
@@ -47,7 +48,7 @@ class WarpEngine:
         wp.config.log_level = wp.LOG_ERROR if jax.default_backend() == "cpu" else wp.LOG_WARNING
         self._mj_model = with_newton_solver(model)
         # `step` returns overflows, so Warp need not print them.
-        self._model = mjx.put_model(self._mj_model, impl="warp", device=jax.local_devices()[0]).tree_replace(
+        self._model = mjx.put_model(self._mj_model, impl="warp", device=default_device()).tree_replace(
             {"opt._impl.warn_overflow": 0}
         )
         last_model = self._model.tree_replace({"opt._impl.run_rne_postconstraint": "cfrc_ext" in derived})
@@ -64,7 +65,7 @@ class WarpEngine:
         self.step = batch_once(self._step)
 
     def _load_kernels(self) -> list[Future]:
-        return load_kernels(self._mj_model, self._njmax, wp.device_from_jax(jax.local_devices()[0]))
+        return load_kernels(self._mj_model, self._njmax, warp_device(default_device()))
 
     def _data(self, state: PhysicsState) -> mjx.Data:
         """Warp's data for the entire batch.
@@ -77,7 +78,7 @@ class WarpEngine:
             blank = mjx.make_data(
                 self._mj_model,
                 impl="warp",
-                device=jax.local_devices()[0],
+                device=default_device(),
                 naconmax=CONTACTS_PER_ENV * num_envs + SPARE_CONTACTS,
                 njmax=self._njmax,
             )
@@ -103,6 +104,14 @@ class WarpEngine:
         qpos = jnp.where(lost_rows[:, None], jnp.nan, data.qpos)
         state = PhysicsState(qpos, data.qvel, data.qacc_warmstart)
         return state, read_derived(data, self._derived, ctrl.shape[:1]), overflow | lost_rows
+
+
+def warp_device(device: jax.Device) -> wp.Device:
+    """Warp's device for a device of this process.
+
+    Deviation: `wp.device_from_jax` takes `id`, which is another GPU, or none, in every process but the first.
+    """
+    return wp.get_device("cpu") if device.platform == "cpu" else wp.get_cuda_device(device.local_hardware_id)
 
 
 def _over_batch(

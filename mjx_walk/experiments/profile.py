@@ -21,6 +21,7 @@ from mjx_walk.experiments.program_costs import learning_flops
 from mjx_walk.experiments.timing import Measurement
 from mjx_walk.runs.config import Config
 from mjx_walk.training.programs import make_init, make_step
+from mjx_walk.utils.devices import default_device
 from mjx_walk.utils.types import Metrics, as_means
 from mjx_walk.viewing.episode import make_gymnasium
 
@@ -173,6 +174,6 @@ def _peak_memory() -> Iterator[Measurement]:
     unit = 1024 if sys.platform == "darwin" else 1
     kibibytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
     yield Measurement("peak memory, host", kibibytes / 2**20, "GiB")
-    stats = jax.devices()[0].memory_stats()
+    stats = default_device().memory_stats()
     if stats:
         yield Measurement("peak memory, device (JAX)", stats["peak_bytes_in_use"] / 2**30, "GiB")

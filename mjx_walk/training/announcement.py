@@ -2,10 +2,9 @@
 
 import logging
 
-import jax
-
 from mjx_walk.runs.config import Config
 from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.utils.devices import default_device
 
 __all__ = ["announce"]
 
@@ -20,7 +19,7 @@ def announce(config: Config, folders: list[RunFolder], num_devices: int) -> None
         folders: of all runs.
         num_devices: devices that train one run together.
     """
-    device = jax.devices()[0]
+    device = default_device()
     where = device.device_kind if device.platform != "cpu" else "the CPU"
     where = where if num_devices == 1 else f"{num_devices} × {where}, one process each"
     path = folders[0].path if len(folders) == 1 else f"{len(folders)} folders of {folders[0].path.parent}"

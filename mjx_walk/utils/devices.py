@@ -36,14 +36,25 @@ def only_device(device: int) -> dict[str, str]:
     return {"CUDA_VISIBLE_DEVICES": visible[device] if visible else str(device)}
 
 
+def default_device() -> jax.Device:
+    """The device of this process on which JAX runs programs by default.
+
+    Its `id` counts the devices of all processes. Its `local_hardware_id` counts the GPUs that this process sees.
+    """
+    chosen = jax.config.jax_default_device  # type: ignore[attr-defined]
+    if isinstance(chosen, str):  # the name of a platform
+        return jax.local_devices(backend=chosen)[0]
+    return chosen or jax.local_devices()[0]
+
+
 def num_bytes(tree: Any) -> int:
     """Bytes of a pytree of arrays or of their shapes and dtypes."""
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
 def device_memory() -> int:
-    """Bytes of memory that JAX may allocate on its first device."""
-    stats = jax.local_devices()[0].memory_stats()
+    """Bytes of memory that JAX may allocate on its default device."""
+    stats = default_device().memory_stats()
     if stats and "bytes_limit" in stats:
         return stats["bytes_limit"]
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
