@@ -2,7 +2,7 @@
 
 Most programs here take longer to compile than to run, and programs that call back into Python, as MuJoCo's C library
 does, are in no cache. `_QUICK_COMPILE` cuts compile times. `helpers.OPTIMIZED` is for programs that run for long.
-`_SAFE_REDUCTIONS` is what `mjx_walk.prepare_jax` sets; tests use JAX before they call anything that sets it.
+`SAFE_REDUCTIONS` is set here, because tests use JAX before they call anything that sets it.
 """
 
 import atexit
@@ -13,10 +13,10 @@ import shutil
 import tempfile
 
 import pytest
+from xla_flags import SAFE_REDUCTIONS, quick_compile
 
 os.environ["JAX_PLATFORMS"] = "cpu"
-_QUICK_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-_SAFE_REDUCTIONS = "--xla_cpu_experimental_ynn_fusion_type=-reduce"
+_QUICK_COMPILE = quick_compile(0)
 
 
 def _temporary_folder() -> str:
@@ -29,7 +29,7 @@ def _temporary_folder() -> str:
 os.environ["XDG_CONFIG_HOME"] = _temporary_folder()
 _FLAGS = os.environ.get("XLA_FLAGS", "")
 if _QUICK_COMPILE not in _FLAGS:  # pytest-xdist's workers inherit the flags
-    os.environ["XLA_FLAGS"] = f"{_QUICK_COMPILE} {_SAFE_REDUCTIONS} {_FLAGS}".rstrip()
+    os.environ["XLA_FLAGS"] = f"{_QUICK_COMPILE} {SAFE_REDUCTIONS} {_FLAGS}".rstrip()
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _temporary_folder()
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
@@ -44,6 +44,20 @@ def pytest_collection_finish():
 def pytest_addoption(parser):
     parser.addoption("--faults", type=int, default=200, help="kills, and damages, of `-m campaign`")
     parser.addoption("--fault-seed", default="0", help="seed of the random faults")
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Print the table of the GPU gate."""
+    from gpu_gate import write_table
+
+    reports = [report for reports in terminalreporter.stats.values() for report in reports if is_gpu_part(report)]
+    if reports:
+        write_table(terminalreporter, reports)
+
+
+def is_gpu_part(report):
+    """Whether a report is the outcome of a part of the GPU gate."""
+    return "gpu" in getattr(report, "keywords", ()) and (report.when == "call" or report.outcome != "passed")
 
 
 @pytest.fixture

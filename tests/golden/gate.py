@@ -20,7 +20,10 @@ from pathlib import Path
 import ml_dtypes
 import numpy as np
 import orbax.checkpoint as ocp
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from cases import NUM_ITERATIONS, ON_POLICY, Case, fast_cases, further_cases
+from xla_flags import SAFE_REDUCTIONS, quick_compile
 
 REFERENCE = "9c96b95"
 """Rebased by a commit that changes bits on purpose, and says which operation."""
@@ -28,8 +31,6 @@ TREE = Path(__file__).resolve().parents[2]
 _NOT_COMPARED = ("wall_seconds", "speed/")
 _OF_FIRST_EVALUATION = ("eval/", "evaluation.best_policy_params.", "evaluation.best_return")
 """Metrics and leaves. On several devices, the first evaluation of the reference scores another key's policy."""
-_QUICK_COMPILE = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
-_SAFE_REDUCTIONS = "--xla_cpu_experimental_ynn_fusion_type=-reduce"
 
 
 def main() -> int:
@@ -70,7 +71,7 @@ def _environment() -> str:
 
 def train(tree: Path, cases: list[Case], out: Path, fault: str = "") -> None:
     """Train cases in a tree, in two processes."""
-    flags = f"{_QUICK_COMPILE} {_SAFE_REDUCTIONS}"
+    flags = f"{quick_compile(1)} {SAFE_REDUCTIONS}"
     env = os.environ | {"PYTHONPATH": str(tree), "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags, "GOLDEN_FAULT": fault}
     workers = []
     for part in (cases[::2], cases[1::2]):
