@@ -31,7 +31,7 @@ from mjx_walk.runs.loggers import require_wandb
 from mjx_walk.runs.metrics import Row, read_rows
 from mjx_walk.runs.overrides import key_of_value
 from mjx_walk.runs.own_tasks import KEY
-from mjx_walk.runs.policies import SavedPolicy, make_task
+from mjx_walk.runs.policies import SavedPolicy, deterministic_policy, make_task
 from mjx_walk.runs.preparation import prepared
 from mjx_walk.runs.renamed import present_key
 from mjx_walk.runs.run_folder import RunFolder
@@ -86,8 +86,7 @@ class Run(SavedPolicy):
 
     @functools.cached_property
     def _episodes(self) -> Episodes:
-        policy = self.algorithm.policy(self.policy_params, deterministic=True)
-        return compile_episodes(self.task, policy)
+        return compile_episodes(self.task, deterministic_policy(self.algorithm, self.policy_params))
 
 
 def load_run(path: str | Path, physics: str | None = None, policy: str = BEST, task: type[Task] | None = None) -> Run:

@@ -22,12 +22,14 @@ from mjx_walk.runs.saved_config import read_saved_config
 from mjx_walk.runs.scores import BEST, FINAL, POLICIES
 from mjx_walk.utils.compat import standard_settings
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.types import PolicyFn
 
 __all__ = [
     "SavedPolicy",
     "best_policy",
     "default_policy",
     "deterministic_act",
+    "deterministic_policy",
     "make_acting_algorithm",
     "make_task",
 ]
@@ -113,10 +115,23 @@ def deterministic_act(algorithm: Algorithm, policy_params: Any) -> Callable[[Any
     @jax.jit
     @standard_settings()
     def act(obs: jax.Array) -> jax.Array:
-        policy = algorithm.policy(policy_params, deterministic=True)
+        policy = deterministic_policy(algorithm, policy_params)
         return policy(jnp.asarray(obs, jnp.float32), jax.random.PRNGKey(0))
 
     return act
+
+
+def deterministic_policy(algorithm: Algorithm, policy_params: Any) -> PolicyFn:
+    """The deterministic policy, `(obs, key) → action`.
+
+    It multiplies matrices in float32. A GPU's default precision would change actions by up to 4e-3.
+    """
+    return functools.partial(_in_float32, algorithm.policy(policy_params, deterministic=True))
+
+
+def _in_float32(policy: PolicyFn, obs: jax.Array, key: jax.Array) -> jax.Array:
+    with jax.default_matmul_precision("float32"):
+        return policy(obs, key)
 
 
 def choose_policy(folder: RunFolder, name: str) -> str:

@@ -31,7 +31,7 @@ class Backward(HalfCheetah):
         return ("cfrc_ext", "subtree_com")
 
     def reward_and_termination(self, before, physics, derived, carry, action):
-        back = (before.qpos[0] - physics.qpos[0]) / self.dt
+        back = (before.physics.qpos[0] - physics.qpos[0]) / self.dt
         calm = -1e-4 * jnp.square(derived["cfrc_ext"]).sum()
         return {"reward_back": back, "reward_calm": calm}, back + calm, jnp.zeros((), bool)
 """
@@ -158,4 +158,4 @@ def test_onnx_equals_the_policy(tmp_path, record_property):
 def test_gymnasium_batch(record_property):
     total = float(run_python(BATCHES))
     record_property("measured", f"return of 100 steps: {total:,.0f}")
-    assert total > 900
+    assert 800 < total < 1000

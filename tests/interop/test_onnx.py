@@ -107,3 +107,10 @@ def test_export_prints_a_one_line_error(tmp_path, capsys):
         assert command_here("export", *arguments) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("error: ") and message in line
+
+
+def test_policies_multiply_in_float32_whatever_the_device_s_precision():
+    run = mjx_walk.load_run("zoo:walker2d-td3", "c")
+    with jax.default_matmul_precision("tensorfloat32"):
+        program = str(jax.make_jaxpr(run.act)(jnp.zeros(17)))
+    assert program.count("dot_general[") == program.count("precision=(Precision.HIGHEST, Precision.HIGHEST)") == 3
