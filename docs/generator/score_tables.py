@@ -53,10 +53,12 @@ def highest_published(task: str) -> str:
 
 def published(several_seeds: bool) -> str:
     """What others have published: means over several seeds, or single runs."""
-    titles = ("Task", "Algorithm", ">Score", ">Std", ">Seeds", ">Steps (M)", "Policy", "Date", "Source")
+    seeds = (">Seeds",) if several_seeds else ()
+    titles = ("Task", "Algorithm", ">Score", ">Std", *seeds, ">Steps (M)", "Policy", "Date", "Source")
     rows = [
         (
-            *(row["task"], row["algorithm"], _number(row["score"]), _number(row["std"]), row["seeds"]),
+            *(row["task"], row["algorithm"], _number(row["score"]), _number(row["std"])),
+            *((row["seeds"],) if several_seeds else ()),
             *(row["million_steps"], row["policy"], row["date"], f"[{row['source']}]({row['link']})"),
         )
         for row in read("published.csv")
