@@ -6,7 +6,7 @@ a test fails if a committed page differs.
 
 from pathlib import Path
 
-from generator import scaling, score_tables, setting_tables, task_pages
+from generator import scaling, score_tables, seed_tables, setting_tables, task_pages
 from generator.markdown import with_block
 
 from mjx_walk import zoo
@@ -24,6 +24,8 @@ def pages() -> dict[Path, str]:
     found[DOCS.parent / "README.md"] = _filled("../README.md", {"best": score_tables.best()})
     scores = {"recipes": score_tables.recipes(), "suite": score_tables.suite(), "zoo": zoo.table()}
     scores |= {"published": score_tables.published(True), "published-runs": score_tables.published(False)}
+    scores |= {"csac-seeds": seed_tables.csac_seeds(), "csac-means": seed_tables.csac_means()}
+    scores |= {"fresh-seeds": seed_tables.other_algorithms(), "ppo-suite": seed_tables.ppo_on_other_tasks()}
     scores["scaling"] = scaling.detailed()
     found[DOCS / "results.md"] = _filled("results.md", scores)
     found[DOCS / "training.md"] = _filled("training.md", {"scaling-summary": scaling.summary()})

@@ -41,6 +41,21 @@ def test_readme_shows_the_best_algorithm_of_each_task():
         assert algorithm in {row["algorithm"] for row in of_task}
 
 
+def test_final_scores_of_recipes_are_in_the_log():
+    log = [row for row in read("experiments.csv") if row["measure"] == "gymnasium"]
+    for row in read("results.csv"):
+        if row["policy"] != "final":
+            continue
+        task = row["task"].removesuffix("-v5")
+        arms = [arm for arm in log if arm["task"] == task and arm["final_mean"] == row["score"]]
+        (arm,) = [arm for arm in arms if round(float(arm["std"])) == int(row["std"])]
+        seeds = [
+            float(one["final_mean"]) for one in log if one["id"].startswith(f"{arm['id']}.s") and "@" not in one["id"]
+        ]
+        assert len(seeds) == int(row["seeds"]) and min(seeds) == float(row["lowest_seed"])
+        assert f"{int(arm['steps']) / 1e6:.1f}" == row["million_steps"]
+
+
 def test_times_of_one_seed_alone_are_in_the_log():
     alone = [row for row in read("results.csv") if row["alone_seconds"]]
     log = {(row["task"], row["seconds"]) for row in read("experiments.csv") if re.fullmatch(r"\d+", row["seeds"])}

@@ -22,9 +22,9 @@ def best() -> str:
     titles += (">Highest published (v5)", ">Highest published (v4)", "Command")
     rows = [
         (
-            *(row["task"], row["algorithm"], _number(row["score"]), _number(row["std"]), row["seeds"]),
+            *(row["task"], row["algorithm"], number(row["score"]), number(row["std"]), row["seeds"]),
             *(row["million_steps"], _minutes(row["alone_seconds"])),
-            *(_number(highest_published(row["task"].replace("v5", version))) for version in ("v5", "v4")),
+            *(number(highest_published(row["task"].replace("v5", version))) for version in ("v5", "v4")),
             code(row["command"]),
         )
         for row in _best_rows()
@@ -57,7 +57,7 @@ def published(several_seeds: bool) -> str:
     titles = ("Task", "Algorithm", ">Score", ">Std", *seeds, ">Steps (M)", "Policy", "Date", "Source")
     rows = [
         (
-            *(row["task"], row["algorithm"], _number(row["score"]), _number(row["std"])),
+            *(row["task"], row["algorithm"], number(row["score"]), number(row["std"])),
             *((row["seeds"],) if several_seeds else ()),
             *(row["million_steps"], row["policy"], row["date"], f"[{row['source']}]({row['link']})"),
         )
@@ -74,9 +74,9 @@ def recipes() -> str:
     rows = [
         (
             *(row["task"], row["algorithm"], row["policy"]),
-            *(_number(row[key]) for key in ("score", "std", "lowest_seed")),
-            *(row["seeds"], row["million_steps"], _number(row["seconds"]), row["seeds_per_process"], row["time_of"]),
-            _number(row["alone_seconds"]),
+            *(number(row[key]) for key in ("score", "std", "lowest_seed")),
+            *(row["seeds"], row["million_steps"], number(row["seconds"]), row["seeds_per_process"], row["time_of"]),
+            number(row["alone_seconds"]),
             code(row["command"]),
         )
         for row in read("results.csv")
@@ -88,7 +88,7 @@ def of_algorithm(name: str) -> str:
     """The recipes of one algorithm, with the cells that a reader compares."""
     rows = [
         (
-            *(row["task"], row["algorithm"], row["policy"], _number(row["score"]), _number(row["std"]), row["seeds"]),
+            *(row["task"], row["algorithm"], row["policy"], number(row["score"]), number(row["std"]), row["seeds"]),
             *(row["million_steps"], code(row["command"])),
         )
         for row in read("results.csv")
@@ -105,10 +105,10 @@ def suite() -> str:
         if _SUITE.fullmatch(name):
             chosen = arms[f"{name}@best"]
             task = f"{final['task']}-{final['version']}"
-            scores = [_number(row[key]) for row in (final, chosen) for key in ("final_mean", "std")]
+            scores = [number(row[key]) for row in (final, chosen) for key in ("final_mean", "std")]
             steps = [f"{int(row['steps']) / 1e6:.1f}" for row in (chosen, final)]
             rows.append(
-                (task, *scores, *steps, _number(final["seconds"]), *(_number(str(score)) for score in REFERENCES[task]))
+                (task, *scores, *steps, number(final["seconds"]), *(number(str(score)) for score in REFERENCES[task]))
             )
     titles = (
         "Task",
@@ -144,7 +144,7 @@ def read(name: str) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def _number(text: str) -> str:
+def number(text: str) -> str:
     """A number as tables show it; a dash for a value that was not recorded."""
     if not text:
         return "–"
