@@ -35,7 +35,7 @@ def csac_seeds() -> str:
     for arm in _CSAC:
         for seed in log[arm]["seeds"].split():
             final, best = log[f"{arm}.s{seed}"], log[f"{arm}.s{seed}@best"]
-            scores = [_rounded(row[key]) for row in (final, best) for key in ("final_mean", "std")]
+            scores = [_round(row[key]) for row in (final, best) for key in ("final_mean", "std")]
             rows.append([final["task"], seed, *scores, _millions(best)])
     titles = ("Task (v5)", ">Seed", ">Final", ">Std", ">Best", ">Its std", ">Best policy's step (M)")
     return table(titles, rows)
@@ -46,8 +46,8 @@ def csac_means() -> str:
     log, rows = _log(), []
     for arm in _CSAC:
         final, best = log[arm], log[f"{arm}@best"]
-        cells = [_rounded(final["final_mean"]), _rounded(final["std"]), *_interval(final)]
-        rows.append([final["task"], *cells, _rounded(best["final_mean"]), _rounded(best["std"])])
+        cells = [_round(final["final_mean"]), _round(final["std"]), *_interval(final)]
+        rows.append([final["task"], *cells, _round(best["final_mean"]), _round(best["std"])])
     titles = ("Task (v5)", ">Final, mean over seeds", ">Std over seeds", ">Interval from", ">Interval to")
     return table((*titles, ">Best, mean over seeds", ">Std over seeds"), rows)
 
@@ -57,8 +57,8 @@ def other_algorithms() -> str:
     log, rows = _log(), []
     for arm, algorithm in _OTHERS.items():
         row = log[arm]
-        seeds = [_rounded(log[f"{arm}.s{seed}"]["final_mean"]) for seed in row["seeds"].split()]
-        rows.append([row["task"], algorithm, *seeds, _rounded(row["final_mean"]), _rounded(row["std"]), *_interval(row)])
+        seeds = [_round(log[f"{arm}.s{seed}"]["final_mean"]) for seed in row["seeds"].split()]
+        rows.append([row["task"], algorithm, *seeds, _round(row["final_mean"]), _round(row["std"]), *_interval(row)])
     titles = ("Task (v5)", "Algorithm", ">Seed 100", ">Seed 101", ">Seed 102", ">Mean", ">Std")
     return table((*titles, ">Interval from", ">Interval to"), rows)
 
@@ -79,7 +79,7 @@ def _log() -> dict[str, Row]:
     return {row["id"]: row for row in read("experiments.csv") if row["measure"] == "gymnasium"}
 
 
-def _rounded(text: str) -> str:
+def _round(text: str) -> str:
     return f"{float(text):,.0f}"
 
 
