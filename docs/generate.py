@@ -26,7 +26,7 @@ def pages() -> dict[Path, str]:
     scores |= {"published": score_tables.published(True), "published-runs": score_tables.published(False)}
     scores |= {"csac-seeds": seed_tables.csac_seeds(), "csac-means": seed_tables.csac_means()}
     scores |= {"fresh-seeds": seed_tables.other_algorithms(), "ppo-suite": seed_tables.ppo_on_other_tasks()}
-    scores["scaling"] = scaling.detailed()
+    scores |= {"six-algorithms": seed_tables.six_algorithms(), "scaling": scaling.detailed()}
     found[DOCS / "results.md"] = _filled("results.md", scores)
     found[DOCS / "training.md"] = _filled("training.md", {"scaling-summary": scaling.summary()})
     found[DOCS / "configuration.md"] = _filled("configuration.md", groups)
