@@ -8,7 +8,7 @@ import numpy as np
 import PIL.Image
 import pytest
 import scipy.stats
-from helpers import CLONE
+from helpers import CLONE, PAGES
 
 from mjx_walk.experiments.suite import REFERENCES, normalize
 
@@ -71,6 +71,17 @@ def test_published_rows_have_link_date_and_budget():
         assert datetime.date.fromisoformat(row["date"]) and row["source"] and row["policy"], row
         assert float(row["million_steps"]) > 0 and int(row["seeds"]) > 0, row
         assert f"({row['link']})" in page
+
+
+def test_pages_compare_with_the_highest_that_was_found():
+    """Never with "the record", which nobody can know."""
+    tables = importlib.import_module("generator.score_tables")
+    highest = {tables.number(tables.highest_published(row["task"])) for row in read("published.csv") if row["std"]}
+    named = []
+    for text in (" ".join(text.split()) for text in PAGES.values()):
+        assert not re.search(r"\bthe (published |world )?record\b", text)
+        named += re.findall(r"multi-seed mean that we found published is ([\d,]*\d)", text)
+    assert named and {*named} <= highest
 
 
 def test_references_are_the_highest_means_of_slm_lab():
