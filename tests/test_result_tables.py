@@ -118,6 +118,16 @@ def test_the_scaling_figure_shows_the_factors_of_the_table():
         assert figure.text["Description"] == importlib.import_module("generator.scaling").summary()
 
 
+def test_pages_name_the_first_start_of_the_table():
+    section = (DOCS / "results.md").read_text().partition("**First start.**")[2]
+    starts = {
+        name: [int(x) for x in row] for name, *row in re.findall(r"\| (\w+) \| (\d+) \| (\d+) \| (\d+) \|", section)[:2]
+    }
+    assert starts.keys() == {"PPO", "csac"} and all(first - later == more for first, later, more in starts.values())
+    for page in ("README.md", "docs/quick_start.md"):
+        assert re.findall(r"(\d+) s (?:more|longer)", (CLONE / page).read_text()) == [str(starts["PPO"][2])]
+
+
 def test_the_error_that_pages_name_is_the_largest_of_the_table():
     errors = [float(row[6]) for row in cells("docs/exactness.md") if len(row) == 9 and row[1] in ("warp", "jax")]
     assert len(errors) == 42
