@@ -6,7 +6,7 @@ a test fails if a committed page differs.
 
 from pathlib import Path
 
-from generator import score_tables, setting_tables, task_pages
+from generator import scaling, score_tables, seed_tables, setting_tables, task_pages
 from generator.markdown import with_block
 
 from mjx_walk import zoo
@@ -23,7 +23,12 @@ def pages() -> dict[Path, str]:
     groups = {name: setting_tables.group_table(name) for name in setting_tables.GROUPS}
     found[DOCS.parent / "README.md"] = _filled("../README.md", {"best": score_tables.best()})
     scores = {"recipes": score_tables.recipes(), "suite": score_tables.suite(), "zoo": zoo.table()}
+    scores |= {"published": score_tables.published(True), "published-runs": score_tables.published(False)}
+    scores |= {"csac-seeds": seed_tables.csac_seeds(), "csac-means": seed_tables.csac_means()}
+    scores |= {"fresh-seeds": seed_tables.other_algorithms(), "ppo-suite": seed_tables.ppo_on_other_tasks()}
+    scores |= {"six-algorithms": seed_tables.six_algorithms(), "scaling": scaling.detailed()}
     found[DOCS / "results.md"] = _filled("results.md", scores)
+    found[DOCS / "training.md"] = _filled("training.md", {"scaling-summary": scaling.summary()})
     found[DOCS / "configuration.md"] = _filled("configuration.md", groups)
     for name in BUILT_IN_ALGORITHMS:
         blocks = {"settings": setting_tables.algorithm_table(name), "scores": score_tables.of_algorithm(name)}

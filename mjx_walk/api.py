@@ -95,7 +95,7 @@ def load_run(path: str | Path, physics: str | None = None, policy: str = BEST, t
     Args:
         path: its folder, or `zoo:NAME`.
         physics: engine to use instead of the run's own.
-        policy: `best`, the policy with the highest evaluation during training, or `final`, the newest one.
+        policy: `best`, the policy with the highest evaluation during training or at its end; `final` is the newest one.
         task: the run's task, if it is your own, and neither registered nor in a file that you trust.
 
     Raises:

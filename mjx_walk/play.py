@@ -22,7 +22,7 @@ USAGE = """
 usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [policy=best|final] [seed=0] [width=640] [height=480] [out=FILE.mp4]
                                [html=FILE.html] [gait=FILE.png] [strip=FILE.png start=5 seconds=1] [viewer=true]
 
-  policy=best     the policy with the highest evaluation during training; policy=final is the newest one
+  policy=best     the policy with the highest evaluation during training or at its end; policy=final is the newest
   out=FILE.mp4    a film of one episode. It is written by default, as RUN_DIR/episode.mp4 or, for a policy of the zoo,
                   as NAME.mp4 in the current folder.
   html=FILE.html  a page that plays the episode in 3D with its reward terms, in any browser, offline (pip install

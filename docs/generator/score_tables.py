@@ -1,11 +1,14 @@
-"""Tables of scores. The figures are in results.csv, experiments.csv and the zoo."""
+"""Tables of scores. The figures are in results.csv, published.csv and experiments.csv."""
 
 import csv
 import re
 from pathlib import Path
 
+import numpy as np
+import scipy.stats
+
 from generator.markdown import code, table
-from mjx_walk.experiments.suite import REFERENCES
+from mjx_walk.experiments.suite import REFERENCES, normalize
 from mjx_walk.utils.text import format_score
 
 _DOCS = Path(__file__).parent.parent
@@ -16,29 +19,64 @@ _SUITE = re.compile(r"MS\d+")
 def best() -> str:
     """For each task the algorithm with the highest score, next to what others have published."""
     titles = ("Task", "Algorithm", ">Score", ">Std", ">Seeds", ">Steps (M)", ">Minutes")
-    published = (">Highest published (v5)", ">Highest published (v4)")
+    titles += (">Highest published (v5)", ">Highest published (v4)", "Command")
     rows = [
         (
-            *(row["task"], row["algorithm"], _number(row["score"]), _number(row["std"]), row["seeds"]),
-            *(row["million_steps"], f"{float(row['seconds']) / 60:.1f}"),
-            *(_number(row["published_v5"]), _number(row["published_v4"])),
+            *(row["task"], row["algorithm"], number(row["score"]), number(row["std"]), row["seeds"]),
+            *(row["million_steps"], _minutes(row["alone_seconds"])),
+            *(number(highest_published(row["task"].replace("v5", version))) for version in ("v5", "v4")),
             code(row["command"]),
         )
-        for row in read("results.csv")
-        if row["published_v5"]
+        for row in _best_rows()
     ]
-    return table((*titles, *published, "Command"), rows)
+    return table(titles, rows)
+
+
+def _best_rows() -> list[dict[str, str]]:
+    """For each task the row of results.csv with the highest score."""
+    found: dict[str, dict[str, str]] = {}
+    for row in read("results.csv"):
+        if float(row["score"]) > float(found.get(row["task"], row | {"score": "-inf"})["score"]):
+            found[row["task"]] = row
+    return list(found.values())
+
+
+def _minutes(seconds: str) -> str:
+    return f"{float(seconds) / 60:.1f}" if seconds else "not measured"
+
+
+def highest_published(task: str) -> str:
+    """The highest mean over several seeds in published.csv."""
+    scores = [row["score"] for row in read("published.csv") if row["task"] == task and int(row["seeds"]) > 1]
+    return max(scores, key=float)
+
+
+def published(several_seeds: bool) -> str:
+    """What others have published: means over several seeds, or single runs."""
+    seeds = (">Seeds",) if several_seeds else ()
+    titles = ("Task", "Algorithm", ">Score", ">Std", *seeds, ">Steps (M)", "Policy", "Date", "Source")
+    rows = [
+        (
+            *(row["task"], row["algorithm"], number(row["score"]), number(row["std"])),
+            *((row["seeds"],) if several_seeds else ()),
+            *(row["million_steps"], row["policy"], row["date"], f"[{row['source']}]({row['link']})"),
+        )
+        for row in read("published.csv")
+        if (int(row["seeds"]) > 1) == several_seeds
+    ]
+    return table(titles, rows)
 
 
 def recipes() -> str:
     """Every recipe for a GPU that has been scored."""
     titles = ("Task", "Algorithm", "Policy", ">Score", ">Std", ">Lowest seed", ">Seeds", ">Steps (M)")
-    times = (">Seconds", ">Seeds per process", "Time of")
+    times = (">Seconds", ">Seeds per process", "Time of", ">One seed alone (s)")
     rows = [
         (
             *(row["task"], row["algorithm"], row["policy"]),
-            *(_number(row[key]) for key in ("score", "std", "lowest_seed")),
-            *(row["seeds"], row["million_steps"], _number(row["seconds"]), row["seeds_per_process"], row["time_of"]),
+            *(number(row[key]) for key in ("score", "std", "lowest_seed")),
+            *(row["seeds"], row["million_steps"], number(row["seconds"]), row["seeds_per_process"], row["time_of"]),
+            number(row["alone_seconds"]),
             code(row["command"]),
         )
         for row in read("results.csv")
@@ -50,7 +88,7 @@ def of_algorithm(name: str) -> str:
     """The recipes of one algorithm, with the cells that a reader compares."""
     rows = [
         (
-            *(row["task"], row["algorithm"], row["policy"], _number(row["score"]), _number(row["std"]), row["seeds"]),
+            *(row["task"], row["algorithm"], row["policy"], number(row["score"]), number(row["std"]), row["seeds"]),
             *(row["million_steps"], code(row["command"])),
         )
         for row in read("results.csv")
@@ -60,16 +98,18 @@ def of_algorithm(name: str) -> str:
 
 
 def suite() -> str:
-    """One seed of csac on every task."""
+    """One seed of csac on every task, and the normalized scores."""
     arms = {row["id"]: row for row in read("experiments.csv")}
     rows = []
     for name, final in arms.items():
         if _SUITE.fullmatch(name):
             chosen = arms[f"{name}@best"]
             task = f"{final['task']}-{final['version']}"
-            scores = [_number(row[key]) for row in (final, chosen) for key in ("final_mean", "std")]
+            scores = [number(row[key]) for row in (final, chosen) for key in ("final_mean", "std")]
             steps = [f"{int(row['steps']) / 1e6:.1f}" for row in (chosen, final)]
-            rows.append((task, *scores, *steps, _number(final["seconds"]), _number(str(REFERENCES[task][1]))))
+            rows.append(
+                (task, *scores, *steps, number(final["seconds"]), *(number(str(score)) for score in REFERENCES[task]))
+            )
     titles = (
         "Task",
         ">Final",
@@ -79,9 +119,23 @@ def suite() -> str:
         ">Best policy's step (M)",
         ">Steps (M)",
         ">Seconds",
-        ">Published",
+        ">Random actions",
+        ">SLM-Lab",
     )
-    return table(titles, rows)
+    return f"{table(titles, rows)}\n\n{_normalized(arms)}"
+
+
+def _normalized(arms: dict[str, dict[str, str]]) -> str:
+    """The normalized scores over all tasks of the final and of the best policies."""
+    means = []
+    for suffix in ("", "@best"):
+        rows = [row for name, row in arms.items() if _SUITE.fullmatch(name.removesuffix(suffix)) and suffix in name]
+        scores = [normalize(f"{row['task']}-{row['version']}", float(row["final_mean"])) for row in rows]
+        means += [f"{np.mean(scores):.2f}", f"{scipy.stats.trim_mean(scores, 0.25):.2f}"]
+    return (
+        'With 0 for random actions and 1 for "SLM-Lab", the final policies have '
+        f"a mean of {means[0]} and an interquartile mean of {means[1]}, the best ones {means[2]} and {means[3]}."
+    )
 
 
 def read(name: str) -> list[dict[str, str]]:
@@ -90,7 +144,7 @@ def read(name: str) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def _number(text: str) -> str:
+def number(text: str) -> str:
     """A number as tables show it; a dash for a value that was not recorded."""
     if not text:
         return "–"

@@ -47,7 +47,7 @@ class SavedPolicy:
             folder: folder of a run that has saved a policy.
             physics: engine to use instead of the run's own.
             policy: `final`, the one of the newest checkpoint, or `best`, the one with the highest evaluation during
-                training. Before the first evaluation ends, there is only `final`, and `best` gives that one.
+                training or at its end. Before the first evaluation ends, there is only `final`, and `best` gives it.
 
         Raises:
             UserError: no usable policy.

@@ -17,7 +17,7 @@ __all__ = ["BEST", "BETTER", "FINAL", "POLICIES", "ScoreFile", "Scores", "read_s
 FINAL = "final"
 """The policy of the newest checkpoint, at the end of the training so far."""
 BEST = "best"
-"""The policy with the highest evaluation during training."""
+"""The policy with the highest evaluation during training or at its end."""
 POLICIES = (FINAL, BEST)
 BETTER = "better"
 """The better of both, chosen on the scored episodes themselves: what a file with one block holds."""
