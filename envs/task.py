@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs import models
 from mjx_walk.envs.info import GymnasiumInfo
+from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, shaping_terms, term_names
@@ -81,6 +82,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         derived = tuple(dict.fromkeys((*self.derived_names(), *self.kept_arrays)))
         self.engine = make_engine(resolve_engine(physics), self.model, options.frame_skip, derived)
         models.check_pose(self.model, derived)
+        self._snapshot = ModelSnapshot(self.model)
         low, high = self.model.actuator_ctrlrange.T
         self.action_low, self.action_high = jnp.float32(low), jnp.float32(high)
         self.action_size = self.model.nu
@@ -210,7 +212,11 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
             qpos: m and rad. Quaternions are stored and observed as given, not normalized.
             qvel: m/s and rad/s.
             warmstart: initial guess of the constraint solver (`qacc_warmstart`), m/s² and rad/s². Default: zeros.
+
+        Raises:
+            UserError: `model` has changed. A traced reset raises it while it is traced.
         """
+        self._snapshot.refuse_changes()
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
         warmstart = jnp.zeros_like(qvel) if warmstart is None else jnp.asarray(warmstart, jnp.float32)
         physics = PhysicsState(qpos, qvel, warmstart)
@@ -240,7 +246,9 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 
         Raises:
             ValueError: the action has another shape. A traced step raises it while it is traced.
+            UserError: `model` has changed, likewise.
         """
+        self._snapshot.refuse_changes()
         check_action_shape(action, (self.action_size,))
         action = jnp.asarray(action, jnp.float32)
         physics, derived, overflow = self.engine.step(state.physics, action)

@@ -11,15 +11,16 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from mjx_walk.envs import State, make_options
+from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.state import check_action_shape
 from mjx_walk.interop.gymnasium_info import add_flags, add_info
 from mjx_walk.interop.gymnasium_programs import make_programs, refuse_fork
 from mjx_walk.interop.gymnasium_sub_env import SubEnv
-from mjx_walk.interop.gymnasium_twin import RENDER_MODES, make_twin, physics_values, refuse_changes, split_keywords
+from mjx_walk.interop.gymnasium_twin import RENDER_MODES, make_twin, split_keywords
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.value_types import type_problem
 
-_NOT_PICKLED = ("_twin", "_original", "_programs", "envs")
+_NOT_PICKLED = ("_twin", "_snapshot", "_init", "_programs", "envs")
 
 
 class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
@@ -80,7 +81,8 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
     def _build(self) -> None:
         self._programs = make_programs(self._options, self._physics)
         self._twin = make_twin(self._options, self._rendering)
-        self._original = physics_values(self._twin.model)
+        self._snapshot = ModelSnapshot(self._twin.model)
+        self._init = {name: getattr(self._twin, name).copy() for name in ("init_qpos", "init_qvel")}
         self.envs = [SubEnv(self, i) for i in range(self.num_envs)]
 
     @property
@@ -97,8 +99,11 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
             seed: one for each environment, or an int, to which environment i adds i. Without a seed, an environment
                 continues its sequence of random numbers.
             options: as in `SyncVectorEnv`.
+
+        Raises:
+            UserError: the model, `init_qpos` or `init_qvel` has changed.
         """
-        refuse_changes(self._twin.model, self._original)
+        self._refuse_changes()
         seeds = self._listed_seeds(seed)
         mask = _checked_mask(options["reset_mask"], self.num_envs) if options and "reset_mask" in options else None
         if mask is not None and self._state is None and not mask.all():
@@ -119,7 +124,9 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             ValueError: the actions have another shape.
+            UserError: the model, `init_qpos` or `init_qvel` has changed.
         """
+        self._refuse_changes()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         check_action_shape(actions, (self.num_envs, self._twin.model.nu))
@@ -195,6 +202,15 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
     def close_extras(self, **kwargs: Any) -> None:
         """Close the OpenGL contexts."""
         self.envs[0]._close_twin()
+
+    def _refuse_changes(self) -> None:
+        self._snapshot.refuse_changes()
+        for name, value in self._init.items():
+            if not np.array_equal(getattr(self._twin, name), value):
+                raise UserError(
+                    f"resets on the device ignore your change to {name}; use vectorization_mode='sync', whose resets "
+                    "read it"
+                )
 
     def _listed_seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
