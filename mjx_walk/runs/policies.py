@@ -28,6 +28,7 @@ __all__ = [
     "best_policy",
     "default_policy",
     "deterministic_act",
+    "kept_policies",
     "make_acting_algorithm",
     "make_task",
 ]
@@ -127,7 +128,7 @@ def choose_policy(folder: RunFolder, name: str) -> str:
     """
     if name not in POLICIES:
         raise UserError(f"policy={name}: choose one of: {', '.join(POLICIES)}")
-    kept = [present for present in POLICIES if checkpoint.find(folder.policy(present))]
+    kept = kept_policies(folder)
     if name in kept:
         return name
     if name == FINAL and kept and not checkpoint.list_steps(folder.checkpoints):
@@ -142,8 +143,12 @@ def choose_policy(folder: RunFolder, name: str) -> str:
 
 def default_policy(folder: RunFolder) -> str:
     """`final`, or `best` for a folder that has kept only that one, as those of the zoo."""
-    final, best = (checkpoint.find(folder.policy(name)) for name in (FINAL, BEST))
-    return BEST if best and not final else FINAL
+    return BEST if kept_policies(folder) == [BEST] else FINAL
+
+
+def kept_policies(folder: RunFolder) -> list[str]:
+    """Names of the policies that a run has kept, `final` first."""
+    return [name for name in POLICIES if checkpoint.find(folder.policy(name))]
 
 
 def _load(folder: RunFolder, name: str, algorithm: Algorithm) -> tuple[Any, dict[str, Any]]:

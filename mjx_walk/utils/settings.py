@@ -13,6 +13,7 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.value_types import type_problem
 
 __all__ = [
+    "MAX_SEED",
     "AnyBut",
     "Row",
     "describe",
@@ -26,6 +27,9 @@ __all__ = [
 ]
 
 Schema = TypeVar("Schema")
+
+MAX_SEED = 2**32 - 1
+"""Largest seed. JAX's random keys hold 32 bits of it, so larger seeds would repeat smaller ones."""
 
 _MAX_ITEMS = 100
 """Values that a list may have. Each layer of a network takes its time to compile."""
