@@ -4,8 +4,6 @@ Each environment holds the real one, its twin. The twin draws resets and renders
 """
 
 import inspect
-import os
-import sys
 from typing import Any
 
 import gymnasium
@@ -17,6 +15,7 @@ from gymnasium.envs.registration import load_env_creator
 
 from mjx_walk.envs import TASKS, State, TaskOptions
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.opengl import has_screen
 from mjx_walk.utils.quiet_mujoco import hide_deprecations
 
 RENDER_KEYWORDS = (
@@ -63,8 +62,7 @@ def make_twin(options: TaskOptions, rendering: dict[str, Any]) -> MujocoEnv:
     Raises:
         UserError: `render_mode="human"` without a screen, with which Gymnasium ends the process.
     """
-    has_screen = sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
-    if rendering.get("render_mode") == "human" and not has_screen:
+    if rendering.get("render_mode") == "human" and not has_screen():
         raise UserError("render_mode='human' needs a screen; use render_mode='rgb_array'")
     spec = gymnasium.spec(TASKS[options.name][0].id_of(options))
     create: Any = load_env_creator(str(spec.entry_point))

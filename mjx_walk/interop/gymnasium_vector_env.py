@@ -10,7 +10,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from mjx_walk.envs import State, make_options
+from mjx_walk.envs import NO_TIME_LIMIT, State, make_options
 from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.state import check_action_shape
 from mjx_walk.interop.gymnasium_info import add_flags, add_info
@@ -47,7 +47,8 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
             physics: engine.
             autoreset_mode: as in `SyncVectorEnv`, finished environments reset in the next step, in the same step, or
                 only when `reset` is called.
-            keywords: Gymnasium's, and those of `TaskOptions`.
+            keywords: Gymnasium's, and those of `TaskOptions`. `max_episode_steps=-1` means no time limit, as in
+                `gymnasium.make`.
 
         Raises:
             UserError: an unknown name, engine or keyword, or a `render_mode` that is of one environment.
@@ -62,7 +63,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
             raise UserError(
                 f"render_mode={mode!r} {does} one environment: use gymnasium.make or vectorization_mode='sync'"
             )
-        self._options, self._physics = make_options(env, **options), physics
+        self._options, self._physics = make_options(env, **_with_gymnasiums_limit(options)), physics
         self.num_envs = num_envs
         self._state: State | None = None
         self._keys: np.ndarray | jax.Array | None = None
@@ -242,6 +243,16 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._build()
+
+
+def _with_gymnasiums_limit(options: dict[str, Any]) -> dict[str, Any]:
+    """Options with a `max_episode_steps` as `gymnasium.make` takes it: None is the task's own limit, -1 is none."""
+    others = {name: value for name, value in options.items() if name != "max_episode_steps"}
+    limit = options.get("max_episode_steps")
+    if limit is None:
+        return others
+    is_unlimited = not type_problem(limit, int) and limit == -1
+    return others | {"max_episode_steps": NO_TIME_LIMIT if is_unlimited else limit}
 
 
 def _checked_mask(mask: Any, num_envs: int) -> np.ndarray:

@@ -110,8 +110,6 @@ def _problem(value: Any, limits: Any) -> str | None:
         return None
     if isinstance(value, float) and math.isnan(value):
         return "must be a number"
-    if isinstance(value, int) and abs(value) > _MAX_INT:
-        return f"must be at most {_MAX_INT}"
     # A value that compares with nothing fails these tests.
     if "above" in limits and not value > limits["above"]:
         return f"must be above {limits['above']}"
@@ -119,6 +117,8 @@ def _problem(value: Any, limits: Any) -> str | None:
         return f"must be at least {limits['at_least']}"
     if "at_most" in limits and not value <= limits["at_most"]:
         return f"must be at most {limits['at_most']}"
+    if isinstance(value, int) and abs(value) > _MAX_INT:
+        return f"must be at most {_MAX_INT}"
     if "below" in limits and not value < limits["below"]:
         return f"must be below {limits['below']}"
     if "choices" in limits and value not in limits["choices"]:
