@@ -16,7 +16,7 @@ from mjx_walk.envs.motors import motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping, shaping_terms, term_names
-from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape, is_finite
+from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape, check_state_shape, is_finite
 from mjx_walk.envs.task_options import TaskOptions, check_version
 from mjx_walk.envs.user_files import load_reward_function
 from mjx_walk.envs.view import View
@@ -209,8 +209,9 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
             warmstart: initial guess of the constraint solver (`qacc_warmstart`), m/s² and rad/s². Default: zeros.
 
         Raises:
-            UserError: `model` has changed. A traced reset raises it while it is traced.
+            UserError: another shape, or `model` has changed. A traced reset raises it while it is traced.
         """
+        check_state_shape(qpos=(qpos, self.model.nq), qvel=(qvel, self.model.nv), warmstart=(warmstart, self.model.nv))
         self._snapshot.refuse_changes()
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
         warmstart = jnp.zeros_like(qvel) if warmstart is None else jnp.asarray(warmstart, jnp.float32)

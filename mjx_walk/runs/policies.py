@@ -89,9 +89,14 @@ class SavedPolicy:
             obs: `[…, observation_size]`, any float dtype.
 
         Raises:
-            UserError: the observation has another size.
+            UserError: the observation has another size, or is no array.
         """
-        obs, size = np.asarray(obs, np.float32), self.task.observation_size
+        size = self.task.observation_size
+        try:
+            obs = np.asarray(obs, np.float32)
+        except (TypeError, ValueError) as error:
+            also = "; env.reset() returns the observation and info" if isinstance(obs, tuple) else ""
+            raise UserError(f"the observation is no array of numbers; this policy takes […, {size}]{also}") from error
         if obs.shape[-1:] != (size,):
             raise UserError(f"the observation has the shape {obs.shape}; this policy takes […, {size}]")
         return np.asarray(self.act(obs))
