@@ -9,7 +9,6 @@ from typing import NamedTuple
 import gymnasium
 import mujoco
 import numpy as np
-from jaxtyping import Int
 
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import user_path
@@ -185,9 +184,3 @@ def is_coordinate(model: mujoco.MjModel, index: int, axis: int) -> bool:
     mujoco.mj_kinematics(model, data)
     is_root = model.body_parentid[model.jnt_bodyid[joint]] == 0
     return bool(is_root and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE and data.xaxis[joint, axis] > 0.99)
-
-
-def motor_dofs(model: mujoco.MjModel) -> Int[np.ndarray, " motors"]:
-    """Ascending indices in `qvel` of the joints with a motor."""
-    is_on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-    return np.unique(model.jnt_dofadr[model.actuator_trnid[is_on_joint, 0]])

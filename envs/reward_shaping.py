@@ -50,20 +50,46 @@ class Shaping:
     keep_y: float = setting(0.0, at_least=0)
     """`exp(-y²)` with y in m, which rewards walking straight. Bodies that move in a plane have no y."""
     shaking: float = setting(0.0, at_least=0)
-    """Minus the mean squared velocity of the joints with a motor, (rad/s)² or, for a slider, (m/s)²."""
+    """Minus the mean squared velocity of the joints that a motor moves, over all their axes: (rad/s)² or, for
+    sliders, (m/s)². A free joint has axes of both kinds."""
     falling: float = setting(0.0, at_least=0)
     """-1 in the step that terminates the episode."""
     backward: float = setting(0.0, at_least=0)
     """Minus the root's backward speed, m/s."""
 
 
-def shaping_terms(shaping: Shaping, step: RewardStep, motor_dofs: Int[np.ndarray, " motors"]) -> Terms:
+def check_shaping(shaping: Shaping, name: str, has_x: bool, has_y: bool, has_motors: bool, can_fall: bool) -> None:
+    """Check that the shaping terms of a task have an effect.
+
+    Args:
+        shaping: weights.
+        name: of the task.
+        has_x: whether `qpos[0]` is the root's x.
+        has_y: whether `qpos[1]` is the root's y.
+        has_motors: whether a motor moves a joint.
+        can_fall: whether a fall terminates the episode.
+
+    Raises:
+        UserError: the first term with a weight that has none.
+    """
+    for term, has_effect, reason in (
+        ("backward", has_x, "has no x coordinate"),
+        ("keep_y", has_y, "has no y coordinate"),
+        ("shaking", has_motors, "has no motor that moves a joint"),
+        ("falling", can_fall, "does not terminate on a fall"),
+    ):
+        weight = vars(shaping)[term]
+        if weight and not has_effect:
+            raise UserError(f"env.shaping.{term}={weight}: {name} {reason}; set it to 0")
+
+
+def shaping_terms(shaping: Shaping, step: RewardStep, motor_dofs: Int[np.ndarray, " dofs"]) -> Terms:
     """Weighted shaping terms of a step, without the disabled ones.
 
     Args:
         shaping: weights.
         step: the step.
-        motor_dofs: indices in `qvel` of the joints with a motor.
+        motor_dofs: indices in `qvel` of the joints that a motor moves.
     """
     terms = {}
     if shaping.keep_y:

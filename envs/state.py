@@ -9,6 +9,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs.physics import PhysicsState
+from mjx_walk.utils.errors import UserError
 
 NO_TIME_LIMIT = 2**31 - 1
 """Value of `max_episode_steps` when a caller or a wrapper applies the time limit."""
@@ -48,6 +49,20 @@ def check_action_shape(action: Any, expected: tuple[int, ...]) -> None:
     """
     if np.shape(action) != expected:
         raise ValueError(f"Action dimension mismatch. Expected {expected}, found {np.shape(action)}")
+
+
+def check_state_shape(**arrays: tuple[Any, int]) -> None:
+    """Check positions and velocities before they are converted.
+
+    Args:
+        arrays: each array by its name, and its number of elements. None is not checked.
+
+    Raises:
+        UserError: an array has another shape.
+    """
+    for name, (array, size) in arrays.items():
+        if array is not None and np.shape(array) != (size,):
+            raise UserError(f"{name} has the shape {np.shape(array)}; give ({size},), and use jax.vmap for a batch")
 
 
 def is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[Array, ""]:

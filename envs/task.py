@@ -11,15 +11,16 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs import models
 from mjx_walk.envs.info import GymnasiumInfo
+from mjx_walk.envs.model_changes import ModelSnapshot
+from mjx_walk.envs.motors import motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
-from mjx_walk.envs.reward_shaping import RewardStep, Terms, shaping_terms, term_names
-from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape, is_finite
+from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping, shaping_terms, term_names
+from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape, check_state_shape, is_finite
 from mjx_walk.envs.task_options import TaskOptions, check_version
 from mjx_walk.envs.user_files import load_reward_function
 from mjx_walk.envs.view import View
 from mjx_walk.utils.compat import standard_dtypes
-from mjx_walk.utils.errors import UserError
 
 __all__ = ["Task"]
 
@@ -81,13 +82,14 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         derived = tuple(dict.fromkeys((*self.derived_names(), *self.kept_arrays)))
         self.engine = make_engine(resolve_engine(physics), self.model, options.frame_skip, derived)
         models.check_pose(self.model, derived)
+        self._snapshot = ModelSnapshot(self.model)
         low, high = self.model.actuator_ctrlrange.T
         self.action_low, self.action_high = jnp.float32(low), jnp.float32(high)
         self.action_size = self.model.nu
         self.init_qpos = jnp.asarray(self.model.qpos0, jnp.float32)
         self.init_qvel = jnp.zeros(self.model.nv, jnp.float32)
         self.observation_size = sum(self.observation_blocks().values())
-        self._motor_dofs = models.motor_dofs(self.model)
+        self._motor_dofs = motor_dofs(self.model)
         self._check_shaping()
         self._reward_function = load_reward_function(options.reward_function) if options.reward_function else None
         self.reward_terms = self._reward_term_names()
@@ -98,15 +100,10 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         return type(self), (self.options, self.engine.name, bool(self.kept_arrays))
 
     def _check_shaping(self) -> None:
-        name, shaping = self.options.name, self.options.shaping
-        if shaping.backward and not (self.HAS_X and models.is_coordinate(self.model, 0, axis=0)):
-            raise UserError(f"env.shaping.backward={shaping.backward}: {name} has no x coordinate; set it to 0")
-        if shaping.keep_y and not (self.HAS_Y and models.is_coordinate(self.model, 1, axis=1)):
-            raise UserError(f"env.shaping.keep_y={shaping.keep_y}: {name} has no y coordinate; set it to 0")
-        if shaping.shaking and not self._motor_dofs.size:
-            raise UserError(f"env.shaping.shaking={shaping.shaking}: no motor drives a joint; set it to 0")
-        if shaping.falling and not self.terminates_on_fall:
-            raise UserError(f"env.shaping.falling={shaping.falling}: {name} does not terminate on a fall; set it to 0")
+        has_x = self.HAS_X and models.is_coordinate(self.model, 0, axis=0)
+        has_y = self.HAS_Y and models.is_coordinate(self.model, 1, axis=1)
+        has_motors, can_fall = self._motor_dofs.size > 0, self.terminates_on_fall
+        check_shaping(self.options.shaping, self.options.name, has_x, has_y, has_motors, can_fall)
 
     @property
     def is_in_gymnasium(self) -> bool:
@@ -210,7 +207,12 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
             qpos: m and rad. Quaternions are stored and observed as given, not normalized.
             qvel: m/s and rad/s.
             warmstart: initial guess of the constraint solver (`qacc_warmstart`), m/s² and rad/s². Default: zeros.
+
+        Raises:
+            UserError: another shape, or `model` has changed. A traced reset raises it while it is traced.
         """
+        check_state_shape(qpos=(qpos, self.model.nq), qvel=(qvel, self.model.nv), warmstart=(warmstart, self.model.nv))
+        self._snapshot.refuse_changes()
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
         warmstart = jnp.zeros_like(qvel) if warmstart is None else jnp.asarray(warmstart, jnp.float32)
         physics = PhysicsState(qpos, qvel, warmstart)
@@ -240,7 +242,9 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 
         Raises:
             ValueError: the action has another shape. A traced step raises it while it is traced.
+            UserError: `model` has changed, likewise.
         """
+        self._snapshot.refuse_changes()
         check_action_shape(action, (self.action_size,))
         action = jnp.asarray(action, jnp.float32)
         physics, derived, overflow = self.engine.step(state.physics, action)

@@ -65,14 +65,18 @@ class Run(SavedPolicy):
 
     @standard_settings()
     def evaluate(self, episodes: int = 100, backend: str = "gymnasium", seed: int = 0) -> Scores:
-        """Score the deterministic policy.
+        """Score the deterministic policy that `load_run` has loaded: by default the best one.
+
+        The command `eval` scores the final one by default.
 
         Args:
             episodes: number of episodes.
             backend: `gymnasium`, the real environment, or `sim`, the engine that the run was loaded with. Both score
                 Gymnasium's reward, `sim` with the run's shaping. A run's `reward_function` is not loaded. A task of
                 your own has no equivalent in Gymnasium: both backends score it in the engine.
-            seed: seed of the resets.
+            seed: in Gymnasium, episode i is reset with `seed + i`, so that `gymnasium.make(…).reset(seed=seed + i)`
+                starts it. Seeds that differ by fewer than `episodes` share episodes: after 0, take 100 for 100 others.
+                With `sim`, every seed has episodes of its own.
 
         Raises:
             UserError: an invalid argument.
@@ -95,7 +99,8 @@ def load_run(path: str | Path, physics: str | None = None, policy: str = BEST, t
     Args:
         path: its folder, or `zoo:NAME`.
         physics: engine to use instead of the run's own.
-        policy: `best`, the policy with the highest evaluation during training or at its end; `final` is the newest one.
+        policy: `best`, the policy with the highest evaluation during training or at its end, or `final`, the newest
+            one. `eval` takes `final` by default; `play` and `export` take `best`, as here.
         task: the run's task, if it is your own, and neither registered nor in a file that you trust.
 
     Raises:

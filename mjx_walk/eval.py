@@ -6,22 +6,24 @@ import warnings
 from mjx_walk import zoo
 from mjx_walk.api import Run, load_run
 from mjx_walk.runs.own_tasks import take_task
-from mjx_walk.runs.policies import default_policy
+from mjx_walk.runs.policies import default_policy, kept_policies
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.scores import POLICIES, Scores, read_scores, write_scores
-from mjx_walk.training.summary import score_lines
+from mjx_walk.training.summary import choice_line, score_lines
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.settings import MAX_SEED, setting
 
 USAGE = """
 usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [policy=final|best] [episodes=100] [backend=gymnasium|sim] [seed=0]
                                [physics=ENGINE]
 
   policy=final        the newest policy; the default, except for runs that keep only the best one, such as the zoo's
-  policy=best         the policy with the highest evaluation during training
+  policy=best         the policy with the highest evaluation during training, which play and export take by default
   backend=gymnasium   the real environment, on the CPU; writes eval_gymnasium.json into the run folder
   backend=sim         the run's own engine, or the one given by physics=
+  seed=N              episode i is reset with N + i, so seeds that differ by fewer than `episodes` share episodes; with
+                      backend=sim, every seed has episodes of its own
   env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
 """
 
@@ -32,7 +34,7 @@ class Arguments:
     policy: str | None = setting(None, choices=POLICIES)
     episodes: int = setting(100, at_least=1)
     backend: str = setting("gymnasium", choices=("gymnasium", "sim"))
-    seed: int = setting(0, at_least=0)
+    seed: int = setting(0, at_least=0, at_most=MAX_SEED)
     physics: str | None = None
 
 
@@ -49,6 +51,8 @@ def main(command_line: list[str]) -> None:
         cli.check_writable(folder.gymnasium_scores)
     scores = run.evaluate(arguments.episodes, arguments.backend, arguments.seed)
     print(*score_lines({run.policy_name: (scores, run.policy_facts["env_steps"])}))
+    if arguments.policy is None and len(kept_policies(folder)) > 1:
+        print(choice_line(run.policy_name))
     if is_saved:
         _save(folder, run, scores)
 

@@ -5,7 +5,9 @@ import dataclasses
 from mjx_walk import zoo
 from mjx_walk.api import load_run
 from mjx_walk.runs.own_tasks import take_task
+from mjx_walk.runs.policies import kept_policies
 from mjx_walk.runs.scores import BEST, POLICIES
+from mjx_walk.training.summary import choice_line
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import replacing, user_path
@@ -15,7 +17,8 @@ USAGE = """
 usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [format=onnx] [dtype=float64|float32]
                                  [out=FILE.onnx]
 
-  policy=best     the policy with the highest evaluation during training; policy=final is the newest one
+  policy=best     the policy with the highest evaluation during training, the default
+  policy=final    the newest policy, which eval scores by default
   out=FILE.onnx   by default RUN_DIR/policy.onnx, or NAME.onnx in the current folder for a policy of the zoo. The model
                   maps `observation`, [N, observation_size], to `action`, [N, action_size] f32, both in Gymnasium's
                   units. It normalizes observations itself.
@@ -27,7 +30,7 @@ usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [forma
 @dataclasses.dataclass
 class Arguments:
     run: str | None = None
-    policy: str = setting(BEST, choices=POLICIES)
+    policy: str | None = setting(None, choices=POLICIES)
     format: str = setting("onnx", choices=("onnx",))
     dtype: str = setting("float64", choices=("float64", "float32"))
     out: str | None = None
@@ -47,12 +50,15 @@ def main(command_line: list[str]) -> None:
     path = user_path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.onnx")
     cli.check_suffix(path, ".onnx")
     cli.check_writable(path)
-    run = load_run(folder.path, "c", arguments.policy)
+    run = load_run(folder.path, "c", arguments.policy or BEST)
     name = f"{run.config.env.name}_{run.config.algo.name}"
     model = translate(run.act, run.task.observation_size, name, arguments.dtype)
     with replacing(path) as new:
         onnx.save(model, str(new))
     print(f"{path}: observation [N, {run.task.observation_size}] → action [N, {run.task.action_size}]")
+    print(f"It holds the {run.policy_name} policy (step {run.policy_facts['env_steps']:,}).")
+    if arguments.policy is None and len(kept_policies(folder)) > 1:
+        print(choice_line(run.policy_name))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from mjx_walk.evaluation.parity import check
 from mjx_walk.evaluation.random_steps import take_random_steps
 from mjx_walk.utils import cli
 from mjx_walk.utils.devices import default_device
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.settings import MAX_SEED, setting
 
 USAGE = """
 usage: python -m mjx_walk.parity [physics=warp|jax] [env=all] [version=v5] [num_envs=32] [steps=60] [seed=0]
@@ -30,7 +30,7 @@ class Arguments:
     version: str = setting("v5", choices=("v5", "v4"))
     num_envs: int | None = setting(None, at_least=3)
     steps: int = setting(60, at_least=1)
-    seed: int = setting(0, at_least=0)
+    seed: int = setting(0, at_least=0, at_most=MAX_SEED)
     random_steps: int = setting(0, at_least=0)
 
 

@@ -11,7 +11,7 @@ from mjx_walk.runs.scores import BEST, POLICIES
 from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import replacing, user_path
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.settings import MAX_SEED, setting
 from mjx_walk.viewing.episode import record_episode
 from mjx_walk.viewing.gait import draw_gait_sheet, frame_strip
 from mjx_walk.viewing.page import require_library, write_page
@@ -22,7 +22,8 @@ USAGE = """
 usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [policy=best|final] [seed=0] [width=640] [height=480] [out=FILE.mp4]
                                [html=FILE.html] [gait=FILE.png] [strip=FILE.png start=5 seconds=1] [viewer=true]
 
-  policy=best     the policy with the highest evaluation during training or at its end; policy=final is the newest
+  policy=best     the policy with the highest evaluation during training or at its end; policy=final is the newest one,
+                  which eval scores by default
   out=FILE.mp4    a film of one episode. It is written by default, as RUN_DIR/episode.mp4 or, for a policy of the zoo,
                   as NAME.mp4 in the current folder.
   html=FILE.html  a page that plays the episode in 3D with its reward terms, in any browser, offline (pip install
@@ -30,7 +31,8 @@ usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [policy=best|final] [seed=0]
   gait=FILE.png   a gait sheet: frames, height and speed of a body, floor contacts, motors, reward terms
   strip=FILE.png  eight frames side by side, over `seconds` from `start`, both in seconds
   env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
-  viewer=true     MuJoCo's live viewer, which needs a screen; it plays episodes until it is closed
+  viewer=true     MuJoCo's live viewer, which needs a screen; it plays episodes until it is closed, with seed, seed + 1
+                  and so on
 """
 
 
@@ -49,7 +51,7 @@ class Arguments:
     start: float | None = setting(None, at_least=0)
     seconds: float | None = setting(None, above=0)
     viewer: bool = False
-    seed: int = setting(0, at_least=0)
+    seed: int = setting(0, at_least=0, at_most=MAX_SEED)
     width: int = setting(640, at_least=64, at_most=4096)
     height: int = setting(480, at_least=64, at_most=4096)
 
@@ -80,7 +82,10 @@ def main(command_line: list[str]) -> None:
         size = None if written == [html] else (arguments.width, arguments.height)
         episode = record_episode(run.task, run.policy, arguments.seed, size)
         shown = _shown(arguments, float(episode.seconds[-1]))
-        print(f"{episode.env}: return {episode.rewards.sum():,.1f} in {len(episode.rewards)} steps")
+        print(
+            f"{run.policy_name.title()} policy (step {run.policy_facts['env_steps']:,}), {episode.env}: "
+            f"return {episode.rewards.sum():,.1f} in {len(episode.rewards)} steps"
+        )
         if film:
             write_film(episode.frames, film, episode.frames_per_second)
         if html:

@@ -25,7 +25,7 @@ TABLES = Path(__file__).parent / "mistakes"
 MODEL = '<mujoco><worldbody><body name="torso">{}<geom size="0.1"/></body></worldbody></mujoco>\n'
 SLIDES = '<joint type="slide"/><joint type="slide" axis="0 1 0"/><joint axis="0 1 0"/>'
 LISTS = {"envs": ", ".join(TASKS), "policies": ", ".join(zoo.names())}
-NAMES = {name: getattr(mjx_walk, name) for name in ("load_run", "make_env", "register_task", "run")}
+NAMES = {name: getattr(mjx_walk, name) for name in ("BraxEnv", "load_run", "make_env", "register_task", "run")}
 
 
 def read(table):

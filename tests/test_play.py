@@ -111,9 +111,15 @@ def test_opengl_is_chosen_and_what_is_missing_is_said(monkeypatch):
     assert choose("glfw", ["egl", "glfw"]) == "glfw"  # the user's stays
     assert choose("", ["egl", "osmesa"]) == "egl"
     assert choose("", ["osmesa"]) == "osmesa"
-    for given in ("foo", "glfw", "disable", "EGL"):
-        with pytest.raises(UserError, match=f"^MUJOCO_GL={given} does not render here; unset it, or choose "):
-            choose(given, ["egl", "disable", "EGL"])
+    valid = {"foo": "egl or osmesa", "egl": "osmesa", "osmesa": "egl", "glfw": "egl or osmesa", "EGL": "egl or osmesa"}
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    for display in ("", ":0"):
+        monkeypatch.setenv("DISPLAY", display) if display else monkeypatch.delenv("DISPLAY", raising=False)
+        for given, others in valid.items():
+            also = " or glfw" if display and given != "glfw" else ""
+            with pytest.raises(UserError) as refused:
+                choose(given, ["EGL"])
+            assert str(refused.value) == f"MUJOCO_GL={given} does not render here; unset it, or try {others}{also}"
     with pytest.raises(UserError, match="nothing to render with: install EGL or OSMesa"):
         choose("", [])
 

@@ -127,15 +127,28 @@ def test_many_episodes_are_played_in_rounds(finished, monkeypatch):
 def test_eval_command(finished, capsys):
     run, _ = finished
     assert command_here("eval", f"run={run.path}", "episodes=2", "backend=sim") == 0
-    assert "Walker2d-v5 on c" in capsys.readouterr().out
+    score, choice = capsys.readouterr().out.splitlines()
+    assert score.startswith("Final policy") and "Walker2d-v5 on c" in score
+    assert "export and load_run take the best one: policy=best" in choice
     file = run.path / "eval_gymnasium.json"
     before = json.loads(file.read_text())
     for name in ("final", "best"):
         assert command_here("eval", f"run={run.path}", f"policy={name}", "episodes=2", "seed=7") == 0
-        assert f"{name.title()} policy (step {before[name]['env_steps']:,}), Walker2d" in capsys.readouterr().out
+        (line,) = capsys.readouterr().out.splitlines()
+        assert line.startswith(f"{name.title()} policy (step {before[name]['env_steps']:,}), Walker2d")
     after = json.loads(file.read_text())
     assert after["final"]["seeds"] == after["best"]["seeds"] == [7, 8]
     file.write_text(json.dumps(before))
+
+
+def test_export_says_which_policy_it_takes(finished, tmp_path, capsys):
+    run, _ = finished
+    steps = {name: mjx_walk.load_run(run.path, policy=name).policy_facts["env_steps"] for name in ("final", "best")}
+    choice = "The best policy has the highest evaluation during training. eval scores the final one: policy=final"
+    for arguments, name, said in (([], "best", [choice]), (["policy=final"], "final", [])):
+        assert command_here("export", f"run={run.path}", f"out={tmp_path}/policy.onnx", *arguments) == 0
+        lines = capsys.readouterr().out.splitlines()[1:]
+        assert lines == [f"It holds the {name} policy (step {steps[name]:,}).", *said]
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The `c` engine: MuJoCo's C library in a host callback. It is fast on a CPU, and the reference for the others."""
 
+import copy
 import functools
 import itertools
 import os
@@ -33,12 +34,12 @@ class CEngine:
     calls_host = True
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
-        self._model = model
+        self._model = copy.copy(model)  # the MJX engines do not see later changes either
         self._num_substeps = num_substeps
         self.preparation = Preparation()
         self._derived_shapes = derived_shapes(model, derived)
         self._num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self._workspaces = [mujoco.MjData(model) for _ in range(self._num_threads)]
+        self._workspaces = [mujoco.MjData(self._model) for _ in range(self._num_threads)]
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(self._num_threads, thread_name_prefix="mujoco")
         self.forward = batch_once(self._forward)

@@ -16,7 +16,7 @@ from mjx_walk.envs import Task
 from mjx_walk.evaluation.gymnasium_worker import send
 from mjx_walk.runs.progress import ScoringProgress
 from mjx_walk.runs.scores import Scores
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.settings import MAX_SEED, setting
 from mjx_walk.utils.signals import undisturbed
 from mjx_walk.utils.subprocesses import start_module
 from mjx_walk.utils.types import PolicyFn
@@ -31,7 +31,7 @@ class ScoreRequest:
 
     episodes: int = setting(100, at_least=1)
     backend: str = setting("gymnasium", choices=("gymnasium", "sim"))
-    seed: int = setting(0, at_least=0)
+    seed: int = setting(0, at_least=0, at_most=MAX_SEED)
 
 
 Episodes = Callable[[jax.Array, int], tuple[jax.Array, jax.Array]]
@@ -47,7 +47,7 @@ def score_in_gymnasium(task: Task, act: Callable[[Any], Any], num_episodes: int,
         task: the environment and its keywords.
         act: a JAX function `[N, observation_size] f32 → [N, action_size] f32`, both in Gymnasium's units.
         num_episodes: N.
-        seed: episode i is reset with `seed + i`.
+        seed: episode i is reset with `seed + i`. Seeds that differ by fewer than N share episodes.
     """
     if not task.is_in_gymnasium:
         return score_in_sim(task, compile_episodes(task, lambda obs, key: act(obs)), num_episodes, seed)

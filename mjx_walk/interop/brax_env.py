@@ -29,8 +29,10 @@ class BraxEnv(base.Env):
             keywords: Gymnasium's, and those of `TaskOptions` except the time limit.
 
         Raises:
-            UserError: an unknown name, engine or keyword.
+            UserError: an unknown name, engine or keyword, or a time limit.
         """
+        if "max_episode_steps" in keywords:
+            raise UserError("BraxEnv has no time limit; give episode_length=N to Brax's EpisodeWrapper or wrap instead")
         self._task = make_env(env, physics, **keywords | {"max_episode_steps": NO_TIME_LIMIT})
         self._own_sys: System | None = None
         self._changed_sys: System | None = None

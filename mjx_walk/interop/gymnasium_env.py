@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from mjx_walk.envs import NO_TIME_LIMIT, State, make_options
+from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.state import check_action_shape
 from mjx_walk.interop.gymnasium_info import single_info
 from mjx_walk.interop.gymnasium_programs import is_forked, make_programs, refuse_fork
@@ -18,12 +19,10 @@ from mjx_walk.interop.gymnasium_twin import (
     RENDER_MODES,
     MujocoAttributes,
     make_twin,
-    physics_values,
-    refuse_changes,
     split_keywords,
 )
 
-_NOT_PICKLED = ("_twin", "_original", "_programs")
+_NOT_PICKLED = ("_twin", "_snapshot", "_programs")
 
 
 class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
@@ -57,12 +56,16 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
         if not is_forked():  # a vectorizer may first ask a worker for its spaces
             self._programs = make_programs(self._options, self._physics)
         self._twin = make_twin(self._options, self._rendering)
-        self._original = physics_values(self._twin.model)
+        self._snapshot = ModelSnapshot(self._twin.model)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Start an episode. A seed gives the start that it gives in Gymnasium, and determines all later episodes."""
+        """Start an episode. A seed gives the start that it gives in Gymnasium, and determines all later episodes.
+
+        Raises:
+            UserError: the model has changed.
+        """
         refuse_fork()
-        refuse_changes(self.model, self._original)
+        self._snapshot.refuse_changes()
         super().reset(seed=seed)
         self._twin.np_random = self.np_random
         self._twin.reset()  # with render_mode="human", it shows the frame as well
@@ -78,8 +81,10 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
 
         Raises:
             ValueError: the action has another shape.
+            UserError: the model has changed.
         """
         refuse_fork()
+        self._snapshot.refuse_changes()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         check_action_shape(action, (self._twin.model.nu,))
@@ -104,8 +109,11 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
         self._state, _ = self._programs.reset_to(qpos, qvel, warmstart)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: jax.device_get(value) for name, value in vars(self).items() if name not in _NOT_PICKLED}
+        state = {name: jax.device_get(value) for name, value in vars(self).items() if name not in _NOT_PICKLED}
+        return state | {"_init": (self.init_qpos, self.init_qvel)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        init = state.pop("_init")
         vars(self).update(state)
         self._build()
+        self.init_qpos, self.init_qvel = init

@@ -3,8 +3,7 @@
 Each environment holds the real one, its twin. The twin draws resets and renders, and is never stepped.
 """
 
-import os
-import sys
+import inspect
 from typing import Any
 
 import gymnasium
@@ -16,6 +15,7 @@ from gymnasium.envs.registration import load_env_creator
 
 from mjx_walk.envs import TASKS, State, TaskOptions
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.opengl import has_screen
 from mjx_walk.utils.quiet_mujoco import hide_deprecations
 
 RENDER_KEYWORDS = (
@@ -30,9 +30,18 @@ RENDER_KEYWORDS = (
 )
 """Gymnasium's keywords that concern frames."""
 
-_PHYSICS = ("body", "jnt", "dof", "geom", "site", "actuator", "tendon", "eq", "pair")
-_APPEARANCE = ("rgba", "matid", "group", "user")
-"""Prefixes of the model's arrays that its motion depends on, and suffixes of those that only frames show."""
+_SETTABLE = (
+    "metadata",
+    "render_mode",
+    "observation_space",
+    "action_space",
+    "spec",
+    "init_qpos",
+    "init_qvel",
+    "_np_random",
+    "_np_random_seed",
+)
+"""Attributes of Gymnasium's environments that have their meaning here as well when they are set."""
 
 RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple")
 
@@ -53,8 +62,7 @@ def make_twin(options: TaskOptions, rendering: dict[str, Any]) -> MujocoEnv:
     Raises:
         UserError: `render_mode="human"` without a screen, with which Gymnasium ends the process.
     """
-    has_screen = sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
-    if rendering.get("render_mode") == "human" and not has_screen:
+    if rendering.get("render_mode") == "human" and not has_screen():
         raise UserError("render_mode='human' needs a screen; use render_mode='rgb_array'")
     spec = gymnasium.spec(TASKS[options.name][0].id_of(options))
     create: Any = load_env_creator(str(spec.entry_point))
@@ -62,34 +70,30 @@ def make_twin(options: TaskOptions, rendering: dict[str, Any]) -> MujocoEnv:
         return create(**spec.kwargs | options.gymnasium_kwargs() | rendering)
 
 
-def physics_values(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Copies of the model's values that its motion depends on, by name."""
-    names = [name for name in dir(model) if name.partition("_")[0] in _PHYSICS and not name.endswith(_APPEARANCE)]
-    values = {name: np.array(getattr(model, name)) for name in names if "_" in name}
-    options = [name for name in dir(model.opt) if not name.startswith("_")]
-    return values | {f"opt.{name}": np.array(getattr(model.opt, name)) for name in options}
-
-
-def refuse_changes(model: mujoco.MjModel, original: dict[str, np.ndarray]) -> None:
-    """Check that the model has the values that the physics was compiled with.
-
-    Raises:
-        UserError: it has others.
-    """
-    for name, value in physics_values(model).items():
-        if not np.array_equal(value, original[name]):
-            raise UserError(f"the physics ignores your change to model.{name}; use xml_file=PATH instead")
-
-
 class MujocoAttributes:
     """The attributes of Gymnasium's `MujocoEnv`, except for a live `data`.
 
-    The physics reads nothing that is written to them, except for the state of `set_state`. In a single environment,
-    resets read `init_qpos` and `init_qvel`.
+    The physics reads only the state of `set_state` and, at resets of a single environment, `init_qpos` and `init_qvel`.
+    Other changes are refused.
     """
 
     _twin: MujocoEnv
     render_mode: str | None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute of the environment.
+
+        Raises:
+            UserError: Gymnasium's environment reads the attribute, and this one does not.
+        """
+        twin = getattr(self, "_twin", None)  # None while the environment is built
+        if twin is not None and name in vars(twin) and name not in _SETTABLE:
+            instead = {"model": "; use xml_file=PATH instead", "data": "; use set_state instead"}
+            keyword = name.removeprefix("_")
+            if keyword in (*inspect.signature(type(twin)).parameters, *RENDER_KEYWORDS):
+                instead[name] = f"; give {keyword}=… to gymnasium.make instead"
+            raise UserError(f"the environment ignores your value of {name}{instead.get(name, '')}")
+        super().__setattr__(name, value)
 
     def _read_state(self) -> State | None:
         """State of this environment; None before the first reset."""
@@ -100,7 +104,7 @@ class MujocoAttributes:
 
     @property
     def model(self) -> mujoco.MjModel:
-        """A copy of the MuJoCo model, from which frames are rendered. Resets refuse changes of its physics."""
+        """A copy of the MuJoCo model, from which frames are rendered. Changes of its physics are refused."""
         return self._twin.model
 
     @property
@@ -117,10 +121,18 @@ class MujocoAttributes:
         """`[nq] f64`, m and rad: the pose to which resets add noise."""
         return self._twin.init_qpos
 
+    @init_qpos.setter
+    def init_qpos(self, value: np.ndarray) -> None:
+        self._twin.init_qpos = value
+
     @property
     def init_qvel(self) -> np.ndarray:
         """`[nv] f64`, m/s and rad/s."""
         return self._twin.init_qvel
+
+    @init_qvel.setter
+    def init_qvel(self, value: np.ndarray) -> None:
+        self._twin.init_qvel = value
 
     @property
     def observation_structure(self) -> dict[str, int]:

@@ -10,16 +10,17 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from mjx_walk.envs import State, make_options
+from mjx_walk.envs import NO_TIME_LIMIT, State, make_options
+from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.state import check_action_shape
 from mjx_walk.interop.gymnasium_info import add_flags, add_info
 from mjx_walk.interop.gymnasium_programs import make_programs, refuse_fork
 from mjx_walk.interop.gymnasium_sub_env import SubEnv
-from mjx_walk.interop.gymnasium_twin import RENDER_MODES, make_twin, physics_values, refuse_changes, split_keywords
+from mjx_walk.interop.gymnasium_twin import RENDER_MODES, make_twin, split_keywords
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.value_types import type_problem
 
-_NOT_PICKLED = ("_twin", "_original", "_programs", "envs")
+_NOT_PICKLED = ("_twin", "_snapshot", "_init", "_programs", "envs")
 
 
 class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
@@ -46,7 +47,8 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
             physics: engine.
             autoreset_mode: as in `SyncVectorEnv`, finished environments reset in the next step, in the same step, or
                 only when `reset` is called.
-            keywords: Gymnasium's, and those of `TaskOptions`.
+            keywords: Gymnasium's, and those of `TaskOptions`. `max_episode_steps=-1` means no time limit, as in
+                `gymnasium.make`.
 
         Raises:
             UserError: an unknown name, engine or keyword, or a `render_mode` that is of one environment.
@@ -61,7 +63,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
             raise UserError(
                 f"render_mode={mode!r} {does} one environment: use gymnasium.make or vectorization_mode='sync'"
             )
-        self._options, self._physics = make_options(env, **options), physics
+        self._options, self._physics = make_options(env, **_with_gymnasiums_limit(options)), physics
         self.num_envs = num_envs
         self._state: State | None = None
         self._keys: np.ndarray | jax.Array | None = None
@@ -80,7 +82,8 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
     def _build(self) -> None:
         self._programs = make_programs(self._options, self._physics)
         self._twin = make_twin(self._options, self._rendering)
-        self._original = physics_values(self._twin.model)
+        self._snapshot = ModelSnapshot(self._twin.model)
+        self._init = {name: getattr(self._twin, name).copy() for name in ("init_qpos", "init_qvel")}
         self.envs = [SubEnv(self, i) for i in range(self.num_envs)]
 
     @property
@@ -97,8 +100,11 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
             seed: one for each environment, or an int, to which environment i adds i. Without a seed, an environment
                 continues its sequence of random numbers.
             options: as in `SyncVectorEnv`.
+
+        Raises:
+            UserError: the model, `init_qpos` or `init_qvel` has changed.
         """
-        refuse_changes(self._twin.model, self._original)
+        self._refuse_changes()
         seeds = self._listed_seeds(seed)
         mask = _checked_mask(options["reset_mask"], self.num_envs) if options and "reset_mask" in options else None
         if mask is not None and self._state is None and not mask.all():
@@ -119,7 +125,9 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             ValueError: the actions have another shape.
+            UserError: the model, `init_qpos` or `init_qvel` has changed.
         """
+        self._refuse_changes()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         check_action_shape(actions, (self.num_envs, self._twin.model.nu))
@@ -196,6 +204,15 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         """Close the OpenGL contexts."""
         self.envs[0]._close_twin()
 
+    def _refuse_changes(self) -> None:
+        self._snapshot.refuse_changes()
+        for name, value in self._init.items():
+            if not np.array_equal(getattr(self._twin, name), value):
+                raise UserError(
+                    f"resets on the device ignore your change to {name}; use vectorization_mode='sync', whose resets "
+                    "read it"
+                )
+
     def _listed_seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
@@ -226,6 +243,16 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._build()
+
+
+def _with_gymnasiums_limit(options: dict[str, Any]) -> dict[str, Any]:
+    """Options with a `max_episode_steps` as `gymnasium.make` takes it: None is the task's own limit, -1 is none."""
+    others = {name: value for name, value in options.items() if name != "max_episode_steps"}
+    limit = options.get("max_episode_steps")
+    if limit is None:
+        return others
+    is_unlimited = not type_problem(limit, int) and limit == -1
+    return others | {"max_episode_steps": NO_TIME_LIMIT if is_unlimited else limit}
 
 
 def _checked_mask(mask: Any, num_envs: int) -> np.ndarray:

@@ -30,6 +30,7 @@ __all__ = [
     "default_policy",
     "deterministic_act",
     "deterministic_policy",
+    "kept_policies",
     "make_acting_algorithm",
     "make_task",
 ]
@@ -90,9 +91,14 @@ class SavedPolicy:
             obs: `[…, observation_size]`, any float dtype.
 
         Raises:
-            UserError: the observation has another size.
+            UserError: the observation has another size, or is no array.
         """
-        obs, size = np.asarray(obs, np.float32), self.task.observation_size
+        size = self.task.observation_size
+        try:
+            obs = np.asarray(obs, np.float32)
+        except (TypeError, ValueError) as error:
+            also = "; env.reset() returns the observation and info" if isinstance(obs, tuple) else ""
+            raise UserError(f"the observation is no array of numbers; this policy takes […, {size}]{also}") from error
         if obs.shape[-1:] != (size,):
             raise UserError(f"the observation has the shape {obs.shape}; this policy takes […, {size}]")
         return np.asarray(self.act(obs))
@@ -142,7 +148,7 @@ def choose_policy(folder: RunFolder, name: str) -> str:
     """
     if name not in POLICIES:
         raise UserError(f"policy={name}: choose one of: {', '.join(POLICIES)}")
-    kept = [present for present in POLICIES if checkpoint.find(folder.policy(present))]
+    kept = kept_policies(folder)
     if name in kept:
         return name
     if name == FINAL and kept and not checkpoint.list_steps(folder.checkpoints):
@@ -157,8 +163,12 @@ def choose_policy(folder: RunFolder, name: str) -> str:
 
 def default_policy(folder: RunFolder) -> str:
     """`final`, or `best` for a folder that has kept only that one, as those of the zoo."""
-    final, best = (checkpoint.find(folder.policy(name)) for name in (FINAL, BEST))
-    return BEST if best and not final else FINAL
+    return BEST if kept_policies(folder) == [BEST] else FINAL
+
+
+def kept_policies(folder: RunFolder) -> list[str]:
+    """Names of the policies that a run has kept, `final` first."""
+    return [name for name in POLICIES if checkpoint.find(folder.policy(name))]
 
 
 def _load(folder: RunFolder, name: str, algorithm: Algorithm) -> tuple[Any, dict[str, Any]]:

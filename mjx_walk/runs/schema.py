@@ -9,7 +9,7 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import ENGINES
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.settings import MAX_SEED, setting
 
 __all__ = ["CheckpointConfig", "Config", "chosen", "setting_types"]
 
@@ -37,7 +37,7 @@ class Config:
     """Size of the recipe. The default follows from the devices that JAX sees."""
     physics: str = setting("auto", choices=("auto", *ENGINES))
     """Physics engine, see `mjx_walk.envs.physics`."""
-    seed: int = setting(0, at_least=0, at_most=2**32 - 1)
+    seed: int = setting(0, at_least=0, at_most=MAX_SEED)
     """Seed of all random numbers of the run."""
     num_envs: int = setting(8192, at_least=1, at_most=2**31 - 1)
     """Training environments on each device."""

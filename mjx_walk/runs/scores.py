@@ -36,6 +36,7 @@ class Scores:
     lengths: np.ndarray
     """`[N] i64`."""
     seeds: list[int]
+    """In Gymnasium the seed of each episode's reset; in an engine the one seed of all episodes."""
     env: str
     """Gymnasium's name, followed by the engine if it is not Gymnasium's."""
 

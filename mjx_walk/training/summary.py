@@ -4,10 +4,10 @@ import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
-from mjx_walk.runs.scores import Scores
+from mjx_walk.runs.scores import BEST, FINAL, Scores
 from mjx_walk.utils.text import duration
 
-__all__ = ["end_lines", "score_lines"]
+__all__ = ["choice_line", "end_lines", "score_lines"]
 
 
 def score_lines(
@@ -24,6 +24,17 @@ def score_lines(
     end = "" if total_steps is None else f" of {total_steps:,}"
     lines = (f"{whose}{name} policy (step {steps:,}{end}), {scores}" for name, (scores, steps) in scored.items())
     return [line[0].upper() + line[1:] for line in lines]
+
+
+def choice_line(taken: str) -> str:
+    """What to say where a command has taken one of a run's two policies by itself.
+
+    Args:
+        taken: `final` or `best`.
+    """
+    if taken == FINAL:
+        return f"The final policy is the newest one. play, export and load_run take the best one: policy={BEST}"
+    return f"The best policy has the highest evaluation during training. eval scores the final one: policy={FINAL}"
 
 
 def end_lines(folders: list[Path], training_seconds: float, total_seconds: float, is_scored: bool) -> list[str]:

@@ -26,7 +26,7 @@ from mjx_walk.utils.console import console
 from mjx_walk.utils.errors import UserError, first_line
 from mjx_walk.utils.files import check_replaceable
 from mjx_walk.utils.near_misses import near_misses
-from mjx_walk.utils.settings import validate
+from mjx_walk.utils.settings import MAX_SEED, validate
 from mjx_walk.utils.signals import Stopped, exit_code, ignore_at_exit
 from mjx_walk.utils.subprocesses import end_with_parent
 from mjx_walk.utils.text import printable
@@ -179,7 +179,7 @@ def read_seeds(value: Any) -> list[int]:
         UserError: neither a number nor a list of different seeds.
     """
     seeds = list(range(value)) if type(value) is int else value
-    are_seeds = isinstance(seeds, list) and all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds)
+    are_seeds = isinstance(seeds, list) and all(type(seed) is int and 0 <= seed <= MAX_SEED for seed in seeds)
     if are_seeds and seeds and len(set(seeds)) == len(seeds):
         return seeds
     raise UserError(

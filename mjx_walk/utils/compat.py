@@ -61,12 +61,16 @@ def standard_dtypes() -> Iterator[None]:
 
 @contextlib.contextmanager
 def standard_settings() -> Iterator[None]:
-    """`standard_dtypes`, JAX's usual random numbers, and any transfers between host and device.
+    """`standard_dtypes`, JAX's usual random numbers, compiled programs, and any transfers between host and device.
 
-    The caller's settings then neither change nor stop a run.
+    The caller's settings then neither change nor stop a run. A warning says that `JAX_DISABLE_JIT` is ignored: Python
+    would take minutes for an iteration, and some programs do not run at all.
     """
+    if jax.config.jax_disable_jit:  # type: ignore[attr-defined]
+        warnings.warn("JAX_DISABLE_JIT is ignored here: runs and policies are compiled", stacklevel=3)
     with (
         standard_dtypes(),
+        jax.disable_jit(False),
         jax.default_prng_impl("threefry2x32"),
         jax.enable_custom_prng(False),
         jax.legacy_prng_key("allow"),

@@ -1,9 +1,17 @@
-"""MuJoCo's import where `MUJOCO_GL` does not work: only rendering needs OpenGL. This module does not import JAX."""
+"""What OpenGL this machine has, and MuJoCo's import where `MUJOCO_GL` does not work: only rendering needs OpenGL.
+
+This module does not import JAX.
+"""
 
 import os
 import sys
 
-__all__ = ["import_mujoco"]
+__all__ = ["has_screen", "import_mujoco"]
+
+
+def has_screen() -> bool:
+    """Whether there is a screen to open a window on."""
+    return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
 
 
 def import_mujoco() -> None:

@@ -13,6 +13,7 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.value_types import type_problem
 
 __all__ = [
+    "MAX_SEED",
     "AnyBut",
     "Row",
     "describe",
@@ -26,6 +27,9 @@ __all__ = [
 ]
 
 Schema = TypeVar("Schema")
+
+MAX_SEED = 2**32 - 1
+"""Largest seed. JAX's random keys hold 32 bits of it, so larger seeds would repeat smaller ones."""
 
 _MAX_ITEMS = 100
 """Values that a list may have. Each layer of a network takes its time to compile."""
@@ -106,8 +110,6 @@ def _problem(value: Any, limits: Any) -> str | None:
         return None
     if isinstance(value, float) and math.isnan(value):
         return "must be a number"
-    if isinstance(value, int) and abs(value) > _MAX_INT:
-        return f"must be at most {_MAX_INT}"
     # A value that compares with nothing fails these tests.
     if "above" in limits and not value > limits["above"]:
         return f"must be above {limits['above']}"
@@ -115,6 +117,8 @@ def _problem(value: Any, limits: Any) -> str | None:
         return f"must be at least {limits['at_least']}"
     if "at_most" in limits and not value <= limits["at_most"]:
         return f"must be at most {limits['at_most']}"
+    if isinstance(value, int) and abs(value) > _MAX_INT:
+        return f"must be at most {_MAX_INT}"
     if "below" in limits and not value < limits["below"]:
         return f"must be below {limits['below']}"
     if "choices" in limits and value not in limits["choices"]:

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from mjx_walk.envs import Task, View
+from mjx_walk.envs.motors import torques_per_force
 from mjx_walk.utils.quiet_mujoco import hide_deprecations
 from mjx_walk.viewing.rendering import choose_opengl
 from mjx_walk.viewing.task_env import TaskEnv
@@ -34,7 +35,7 @@ class Episode:
     body: np.ndarray
     """`[T, 3]`, position of the body that the view names."""
     motor_forces: np.ndarray
-    """`[T, nu]`, torque or, on a slider, force of each motor."""
+    """`[T, nu]`, torque or, on a slider or a tendon, force of each motor."""
     floor_contacts: np.ndarray
     """`[T, nbody] bool`: the body touches the floor."""
     rewards: np.ndarray
@@ -83,6 +84,7 @@ def record_episode(
     env = make_gymnasium(task) if size is None else _make_rendered(task, *size)
     inner: Any = env.unwrapped
     model, data = inner.model, inner.data
+    torques = torques_per_force(model)
     steps_per_frame = max(1, round(1.0 / (inner.dt * frame_rate)))
     kept: defaultdict[str, list[Any]] = defaultdict(list)
     terms: defaultdict[str, list[float]] = defaultdict(list)
@@ -94,7 +96,7 @@ def record_episode(
         is_over = terminated or truncated
         kept["qpos"].append(data.qpos.copy())
         kept["body"].append(data.xpos[task.view.body].copy())
-        kept["motor_forces"].append(data.actuator_force * model.actuator_gear[:, 0])
+        kept["motor_forces"].append(data.actuator_force * torques)
         kept["floor_contacts"].append(_floor_contacts(model, data))
         kept["rewards"].append(float(reward))
         for name in task.gymnasium_reward_terms:

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.gridspec import SubplotSpec
 
+from mjx_walk.envs.motors import joint_of
 from mjx_walk.utils.files import replacing
 from mjx_walk.utils.text import format_score
 from mjx_walk.viewing.episode import Episode
@@ -121,15 +122,15 @@ def _lines(axes: Axes, episode: Episode, shown: slice, series: dict[str, np.ndar
 
 
 def _limb_and_name(model: mujoco.MjModel, motor: int) -> tuple[str, str]:
-    """The limb that a motor drives and the motor's name, or without one the joint's.
+    """The limb that a motor drives and the motor's name, or without one that of the joint that only this motor drives.
 
     A limb is named after its first body. It begins where the tree of bodies branches.
     """
-    name = model.actuator(motor).name
-    if model.actuator_trntype[motor] != mujoco.mjtTrn.mjTRN_JOINT:
+    name, joint = model.actuator(motor).name, joint_of(model, motor)
+    if joint is None:
         return "other motors", name or f"motor {motor}"
-    joint = int(model.actuator(motor).trnid[0])
     body = int(model.jnt_bodyid[joint])
     while (parent := int(model.body_parentid[body])) and (model.body_parentid == parent).sum() == 1:
         body = parent
-    return _body_name(model, body), name or model.joint(joint).name
+    is_only = sum(joint_of(model, other) == joint for other in range(model.nu)) == 1
+    return _body_name(model, body), name or (is_only and model.joint(joint).name) or f"motor {motor}"

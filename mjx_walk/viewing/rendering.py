@@ -13,6 +13,7 @@ import numpy as np
 
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import replacing
+from mjx_walk.utils.opengl import has_screen
 from mjx_walk.utils.subprocesses import python
 
 _RENDERERS = ("egl", "osmesa", "glfw")
@@ -31,8 +32,8 @@ def choose_opengl() -> None:
     chosen = os.environ.get("MUJOCO_GL")
     if chosen:
         if chosen not in _RENDERERS or not _works(chosen):
-            valid = ", ".join(_RENDERERS)
-            raise UserError(f"MUJOCO_GL={chosen} does not render here; unset it, or choose another of: {valid}")
+            others = [name for name in _RENDERERS if name != chosen and (name != "glfw" or has_screen())]
+            raise UserError(f"MUJOCO_GL={chosen} does not render here; unset it, or try {' or '.join(others)}")
         return
     os.environ.pop("MUJOCO_GL", None)  # Gymnasium refuses an empty one
     if sys.platform != "linux":

@@ -186,13 +186,46 @@ def test_a_window_opens_on_a_screen():
     assert done.stdout.strip() == "1 (480, 480)", done.stderr
 
 
-def test_a_changed_model_is_not_ignored():
-    env = gymnasium.make("mjx_walk/Walker2d-v5", physics="c")
-    env.unwrapped.model.geom_rgba[:] = 1.0
+def make_or_make_vec(num_envs):
+    name = "mjx_walk/InvertedPendulum-v5"
+    return gymnasium.make_vec(name, num_envs, physics="c") if num_envs else gymnasium.make(name, physics="c")
+
+
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_a_changed_model_is_not_ignored(num_envs):
+    env = make_or_make_vec(num_envs)
+    env.reset(seed=0)
+    model = env.get_attr("model")[-1] if num_envs else env.unwrapped.model
+    model.light_pos[:] = 0.0
     env.reset()
-    env.unwrapped.model.body_mass[1] *= 2.0
-    with pytest.raises(UserError, match=r"ignores your change to model\.body_mass; use xml_file=PATH"):
-        env.reset()
+    model.qpos_spring[0] = 0.1
+    for call in (env.reset, lambda: env.step(env.action_space.sample())):
+        with pytest.raises(UserError, match=r"ignores your change to model\.qpos_spring; use xml_file=PATH"):
+            call()
+
+
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_attributes_without_effect_cannot_be_set(num_envs):
+    env = make_or_make_vec(num_envs)
+    part = env.envs[-1] if num_envs else env.unwrapped
+    with pytest.raises(UserError, match=r"ignores your value of _reset_noise_scale; give reset_noise_scale=… to"):
+        part._reset_noise_scale = 0.0
+    with pytest.raises(UserError, match="ignores your value of data; use set_state instead"):
+        part.data = None
+    part.my_note = 1
+    assert part.my_note == 1
+
+
+def test_the_start_can_be_set():
+    env = make_or_make_vec(None).unwrapped
+    env.init_qpos = np.array([0.5, 0.0])
+    first = env.reset(seed=0)[0]
+    assert abs(first[0] - 0.5) < 0.02
+    np.testing.assert_array_equal(copy.deepcopy(env).reset(seed=0)[0], first)
+    envs = make_or_make_vec(2)
+    envs.envs[0].init_qpos[0] = 0.5
+    with pytest.raises(UserError, match="resets on the device ignore your change to init_qpos; use vectorization_mode"):
+        envs.reset()
 
 
 @renders

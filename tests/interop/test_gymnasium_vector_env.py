@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 from helpers import renders, slow_except
 from side_by_side import assert_same, make_both
 
+from mjx_walk.envs import NO_TIME_LIMIT
 from mjx_walk.utils.errors import UserError
 
 
@@ -64,6 +65,13 @@ def test_every_mode_of_resets_is_gymnasiums(name, mode):
             masks = [{"reset_mask": is_over.copy()} for _ in range(2)]
             assert_same(ours.reset(options=masks[0]), real.reset(options=masks[1]), atol=0.05)
     assert terminated and truncated
+
+
+@pytest.mark.parametrize(("given", "limit"), [(-1, NO_TIME_LIMIT), (None, 1000), (7, 7)])
+def test_a_time_limit_means_what_it_means_in_gymnasium(given, limit):
+    name = "mjx_walk/InvertedPendulum-v5"
+    made = gymnasium.make_vec(name, num_envs=2, physics="c", max_episode_steps=given)
+    assert made._options.max_episode_steps == limit
 
 
 def test_an_environment_depends_on_its_own_seed():

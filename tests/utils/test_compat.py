@@ -1,5 +1,6 @@
 """JAX's settings: prepared by those who start programs, and restored at the end of a run."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -32,7 +33,11 @@ def test_a_run_leaves_the_settings_of_its_caller(chosen, tmp_path, monkeypatch):
         with jax.default_matmul_precision("bfloat16"), temporary_jax_settings("float32"):
             assert jax.config.jax_default_matmul_precision == "float32"
             assert jax.config.jax_compilation_cache_dir == (own or str(tmp_path / "user" / "mjx_walk" / "jax"))
-        with jax.enable_x64(True), jax.default_prng_impl("rbg"), jax.numpy_rank_promotion("raise"):
+        callers = (jax.enable_x64(True), jax.default_prng_impl("rbg"), jax.numpy_rank_promotion("raise"))
+        warned = pytest.warns(UserWarning, match="JAX_DISABLE_JIT is ignored here")
+        with contextlib.ExitStack() as settings:
+            for setting in (*callers, jax.disable_jit(), warned):
+                settings.enter_context(setting)
             run = mjx_walk.run([*TINY, f"run_dir={tmp_path}/run", f"total_steps={TINY_CALL}"])
         assert settings_of_process() == before
         assert not {leaf.dtype for leaf in jax.tree.leaves(run.policy_params)} & {jnp.dtype("f8"), jnp.dtype("i8")}

@@ -34,3 +34,11 @@ def test_a_motor_that_drives_no_joint_has_no_limb():
         "<actuator><general site='s'/></actuator></mujoco>"
     )
     assert _limb_and_name(model, 0) == ("other motors", "motor 0")
+
+
+def test_each_motor_of_a_joint_has_a_name_of_its_own():
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body name='b'><joint name='j' type='ball'/><geom size='1'/></body></worldbody><actuator>"
+        "<motor joint='j' gear='1 0 0'/><motor jointinparent='j' gear='0 1 0'/></actuator></mujoco>"
+    )
+    assert [_limb_and_name(model, motor) for motor in (0, 1)] == [("b", "motor 0"), ("b", "motor 1")]
