@@ -21,6 +21,7 @@ from mjx_walk.utils import cli
 from mjx_walk.utils.devices import count_devices
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import user_path
+from mjx_walk.utils.nvidia import warn_of_unused_gpu
 from mjx_walk.utils.settings import setting
 from mjx_walk.utils.signals import exit_code
 
@@ -71,6 +72,8 @@ def main(command_line: list[str]) -> int:
         raise UserError(f"out={arguments.out} is a file; give a folder")
     seeds = cli.read_seeds(arguments.seeds)
     hardware, available = count_devices()
+    if hardware == "cpu":
+        warn_of_unused_gpu()
     count = arguments.devices or available
     if count > available:
         raise UserError(f"devices={count}: this machine has {available}; leave it out to use all")

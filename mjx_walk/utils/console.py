@@ -86,6 +86,11 @@ class _OneLineOnce:
         return text
 
 
+def _is_not_about_gpus(record: logging.LogRecord) -> bool:
+    """Whether a message of JAX is not the one of a GPU that it does not use; `utils.nvidia` says why and what to do."""
+    return not record.getMessage().startswith(("An NVIDIA GPU may be present", "CUDA backend failed to initialize"))
+
+
 def _say_nothing_of_interrupts(unraisable: Any) -> None:
     """Hide a Ctrl-C that meets code which cannot raise, such as a callback of the garbage collector."""
     if not (unraisable.exc_type and issubclass(unraisable.exc_type, KeyboardInterrupt)):
@@ -105,6 +110,8 @@ def console() -> Iterator[None]:
     logger.propagate = False  # other libraries may have added handlers to the root logger
     warnings.formatwarning = _OneLineOnce()  # type: ignore[assignment]
     unraisable_hook, sys.unraisablehook = sys.unraisablehook, _say_nothing_of_interrupts
+    jax_logger = logging.getLogger("jax._src.xla_bridge")
+    jax_logger.addFilter(_is_not_about_gpus)
     try:
         yield
     finally:
@@ -116,3 +123,4 @@ def console() -> Iterator[None]:
         logger.propagate = propagate
         warnings.formatwarning = format_warning
         sys.unraisablehook = unraisable_hook
+        jax_logger.removeFilter(_is_not_about_gpus)
