@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator
 from typing import IO, Any
 
+from mjx_walk.utils.streams import open_standard_streams
 from mjx_walk.utils.text import printable
 
 __all__ = ["console"]
@@ -23,7 +24,7 @@ class _Output:
         Args:
             stream: what to write to; None where the process was started with a closed stream.
         """
-        self._stream: Any = stream or open(os.devnull, "w")  # noqa: SIM115  # until the process ends
+        self._stream: Any = stream or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # until the process ends
         if hasattr(self._stream, "reconfigure"):
             self._stream.reconfigure(errors="backslashreplace")  # an encoding may lack letters
 
@@ -100,6 +101,7 @@ def _say_nothing_of_interrupts(unraisable: Any) -> None:
 @contextlib.contextmanager
 def console() -> Iterator[None]:
     """Show this package's log messages, format warnings in one line, and outlive the reader of the output."""
+    open_standard_streams()
     logger, handler = logging.getLogger("mjx_walk"), _Handler()
     level, propagate, format_warning = logger.level, logger.propagate, warnings.formatwarning
     stdout, stderr = sys.stdout, sys.stderr

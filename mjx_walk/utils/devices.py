@@ -19,7 +19,7 @@ def count_devices() -> tuple[str, int]:
         UserError: JAX does not start.
     """
     code = "import jax; print(jax.default_backend() != 'cpu', jax.local_device_count())"
-    done = subprocess.run([*python(), "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run([*python(), "-c", code], capture_output=True, encoding="utf-8", errors="replace", check=False)
     if done.returncode:
         raise UserError(f"JAX does not start: {done.stderr.strip().splitlines()[-1]}")
     is_gpu, count = done.stdout.split()[-2:]

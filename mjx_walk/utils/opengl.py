@@ -1,7 +1,9 @@
-"""MuJoCo's import where `MUJOCO_GL` does not work: only rendering needs OpenGL. This module does not import JAX."""
+"""MuJoCo's import where `MUJOCO_GL` does not work, or where a standard stream is closed. It does not import JAX."""
 
 import os
 import sys
+
+from mjx_walk.utils.streams import with_standard_streams
 
 __all__ = ["import_mujoco"]
 
@@ -10,11 +12,19 @@ def import_mujoco() -> None:
     """Import MuJoCo without OpenGL if `MUJOCO_GL` is invalid, or names a library that is missing.
 
     MuJoCo's own import fails then. `viewing.rendering.choose_opengl` reports such a value when something is rendered.
-    Without `MUJOCO_GL` this function does nothing: the first module that needs MuJoCo imports it.
+    Without `MUJOCO_GL` this function does nothing: the first module that needs MuJoCo imports it. It does import MuJoCo
+    where a standard stream is closed. GLFW, which MuJoCo imports, starts a child process that needs all of them.
     """
     chosen = os.environ.get("MUJOCO_GL")
-    if not chosen:
-        return
+    with with_standard_streams() as are_needed:
+        if chosen:
+            _import_with(chosen)
+        elif are_needed:
+            import mujoco  # noqa: F401
+
+
+def _import_with(chosen: str) -> None:
+    """Import MuJoCo with a value of `MUJOCO_GL`, and without OpenGL if that fails."""
     try:
         import mujoco
     except Exception:  # each library fails with another type
