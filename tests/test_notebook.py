@@ -78,7 +78,7 @@ def run_first_cell(tmp_path, monkeypatch, source, in_clone, driver=None, has_cud
             raise FileNotFoundError
         return types.SimpleNamespace(stdout=f"{driver}\n")
 
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: "jax" in name and has_cuda_12 or None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: ("jax" in name and has_cuda_12) or None)
     monkeypatch.setattr("subprocess.run", run)
     exec(cell.source.replace('SOURCE = ""', f"SOURCE = {source!r}"), {})
     return ran
