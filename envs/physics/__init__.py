@@ -13,6 +13,7 @@ import mujoco
 from mjx_walk.envs.physics.base import Derived, Engine, PhysicsState
 from mjx_walk.envs.physics.preparation import nothing_runs
 from mjx_walk.envs.physics.supported import refuse_unsupported, unsupported_by_mjx, warn_of_approximations
+from mjx_walk.utils.devices import default_backend
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.nvidia import Machine, installed_version, warn_of_unused_gpu, warp_misfit
 
@@ -32,6 +33,7 @@ def resolve_engine(name: str) -> str:
         UserError: an unknown name, `warp` without Warp installed or with a driver that is too old, or `c` on an
             accelerator.
     """
+    default_backend()
     device = jax.config.jax_default_device or jax.devices()[0]  # type: ignore[attr-defined]
     platform = device.platform
     if name != "c":

@@ -35,8 +35,8 @@ Variants = dict[wp.Module, set[int | None]]
 def choose_cache() -> None:
     """Have Warp keep its kernels until this process ends, where the user's cache folder is missing or read-only.
 
-    Warp would create a folder named `~` in the working directory, or fail. A folder that the user has chosen stays. Call
-    this function before Warp starts.
+    Warp would create a folder named `~` in the working directory, or fail. A folder that the user has chosen stays.
+    Call this function before Warp starts.
     """
     if wp.config.kernel_cache_dir or "WARP_CACHE_PATH" in os.environ:
         return

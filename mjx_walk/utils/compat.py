@@ -105,6 +105,12 @@ def temporary_jax_settings(matmul_precision: str) -> Iterator[None]:
             _set_cache_dir(None)
 
 
+def _set_cache_dir(path: str | None) -> None:
+    """Change JAX's cache folder. JAX opens a folder once, so it has to close the former one."""
+    compilation_cache.reset_cache()
+    jax.config.update("jax_compilation_cache_dir", path)
+
+
 def default_cache_dir() -> Path | None:
     """The folder of compiled programs, below the user's cache folder. None if the user has no home folder."""
     folder = user_folder("XDG_CACHE_HOME", ".cache")

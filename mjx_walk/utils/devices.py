@@ -10,6 +10,21 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.subprocesses import python
 
 
+def default_backend() -> str:
+    """Name of JAX's default backend, such as `cpu` or `gpu`.
+
+    Raises:
+        UserError: JAX does not start, for example because `JAX_PLATFORMS` names what this machine does not have.
+    """
+    try:
+        return jax.default_backend()
+    except (RuntimeError, AssertionError) as error:
+        chosen = jax.config.jax_platforms  # type: ignore[attr-defined]
+        asked = f" with JAX_PLATFORMS={chosen}" if chosen else ""
+        reason = " ".join(str(error).split()) or "there is no such device; unset it, or set JAX_PLATFORMS=cpu"
+        raise UserError(f"JAX does not start{asked}: {reason}") from error
+
+
 def count_devices() -> tuple[str, int]:
     """`gpu` or `cpu`, and the number of devices. A CPU counts as one.
 

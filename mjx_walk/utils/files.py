@@ -83,12 +83,6 @@ def is_writable_folder(folder: Path) -> bool:
     return os.access(folder, os.W_OK | os.X_OK)
 
 
-def _set_cache_dir(path: str | None) -> None:
-    """Change JAX's cache folder. JAX opens a folder once, so it has to close the former one."""
-    compilation_cache.reset_cache()
-    jax.config.update("jax_compilation_cache_dir", path)
-
-
 @contextlib.contextmanager
 def replacing(path: Path, mode: int = 0o666) -> Iterator[Path]:
     """Context manager for writing a file under a fresh name in the same folder. On success it replaces `path`.

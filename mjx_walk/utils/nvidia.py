@@ -117,7 +117,7 @@ def why_unused(
     elif not plugins:
         why = f"JAX's CUDA plugin is not installed; {_what_to_install(machine)}"
     else:
-        why = _why_plugin_fails(machine, plugins[0], installed, error)
+        why = _why_plugin_fails(machine, plugins[0], installed, error, visible)
     return f"this machine has an NVIDIA GPU, but JAX runs on the CPU: {why}"
 
 
@@ -141,7 +141,9 @@ def _what_to_install(machine: Machine) -> str:
     return f"update the driver, {machine.driver}, to {CUDA_13_DRIVER} or later, and pip install 'mjx-walk[cuda]'"
 
 
-def _why_plugin_fails(machine: Machine, cuda: int, installed: Mapping[str, str], error: str | None) -> str:
+def _why_plugin_fails(
+    machine: Machine, cuda: int, installed: Mapping[str, str], error: str | None, visible: str | None
+) -> str:
     needed = CUDA_13_DRIVER if cuda == 13 else CUDA_12_DRIVER
     if machine.release is not None and machine.release < needed:
         why = f"the driver, {machine.driver}, is older than {needed}, which JAX's CUDA {cuda} plugin needs; update it"
@@ -152,8 +154,9 @@ def _why_plugin_fails(machine: Machine, cuda: int, installed: Mapping[str, str],
     if plugin != jaxlib:
         return f"jax-cuda{cuda}-plugin {plugin} does not fit jaxlib {jaxlib}; pip install 'jax[cuda{cuda}]=={jaxlib}'"
     reason = f" ({' '.join(error.split())[:300]})" if error else ""
+    shown = f", CUDA_VISIBLE_DEVICES={visible} names one" if visible else ""
     return (
-        f"its CUDA {cuda} plugin does not start{reason}; check that nvidia-smi lists the GPU and that LD_LIBRARY_PATH "
+        f"its CUDA {cuda} plugin does not start{reason}; check that nvidia-smi lists GPUs{shown}, and LD_LIBRARY_PATH "
         f"is unset, then pip install --force-reinstall 'jax[cuda{cuda}]=={jaxlib}'"
     )
 

@@ -81,7 +81,8 @@ REASONS = {
     "a plugin that fails": (
         {"driver": "580.1"},
         {"installed": PLUGIN, "error": "no supported devices\nfound", "visible": "0"},
-        "its CUDA 13 plugin does not start (no supported devices found); check that nvidia-smi lists the GPU",
+        "its CUDA 13 plugin does not start (no supported devices found); check that nvidia-smi lists GPUs, "
+        "CUDA_VISIBLE_DEVICES=0 names one, and LD_LIBRARY_PATH is unset",
     ),
     "a container": ({"driver": "580.1", "devices": ()}, {}, "this container has no access to it; start it with GPUs"),
     "no driver": (

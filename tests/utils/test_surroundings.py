@@ -7,6 +7,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest import mock
 
 import jax
 import pytest
@@ -148,6 +149,22 @@ def test_an_argument_that_the_locale_cannot_read(monkeypatch, capsys):
     line = line_of(train_command.main, [os.fsdecode(b"run_dir=gr\xc3\xb6\xff")], monkeypatch, capsys)
     expected = r"the argument 'run_dir=grö\xff' is no text in the encoding of this locale, ascii; set PYTHONUTF8=1"
     assert line == f"error: {expected}"
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (
+            RuntimeError("Unable to initialize backend 'cuda':\nno plugin"),
+            "Unable to initialize backend 'cuda': no plugin",
+        ),
+        (AssertionError(), "there is no such device; unset it, or set JAX_PLATFORMS=cpu"),
+    ],
+)
+def test_jax_does_not_start(monkeypatch, capsys, error, says):
+    monkeypatch.setattr(jax, "default_backend", mock.Mock(side_effect=error))
+    line = line_of(train_command.main, ["env=walker2d"], monkeypatch, capsys)
+    assert line == f"error: JAX does not start with JAX_PLATFORMS=cpu: {says}"
 
 
 def test_no_folder_for_temporary_files(monkeypatch, capsys):
