@@ -33,7 +33,7 @@ def resolve_engine(name: str) -> str:
         UserError: an unknown name, `warp` without Warp installed or with a driver that is too old, or `c` on an
             accelerator.
     """
-    default_backend()
+    default_backend()  # says in one line why JAX does not start
     device = jax.config.jax_default_device or jax.devices()[0]  # type: ignore[attr-defined]
     platform = device.platform
     if name != "c":
