@@ -134,7 +134,7 @@ def resolve(overrides: list[str]) -> Config:
 
 
 def resolve_seeds(overrides: list[str], seeds: list[int]) -> list[Config]:
-    """The configurations of a command line for several seeds, each with the folder `seed_N` in `run_dir`.
+    """The configurations of a command line for several seeds, each with the folder `seed_N` in a given `run_dir`.
 
     Raises:
         UserError: invalid overrides.
@@ -144,9 +144,10 @@ def resolve_seeds(overrides: list[str], seeds: list[int]) -> list[Config]:
     config = load_config(overrides)
     if config.run_dir is None and config.resume:
         raise UserError("resume=true needs run_dir=PATH of the folder that holds the seeds")
-    parent = Path(config.run_dir or run_folder.new_path(config))
-    with_seeds = (dataclasses.replace(config, seed=seed, run_dir=str(parent / f"seed_{seed}")) for seed in seeds)
-    return [_as_saved(config, overrides) for config in with_seeds]
+    with_seeds = [dataclasses.replace(config, seed=seed) for seed in seeds]
+    for one in with_seeds:
+        one.run_dir = str(Path(one.run_dir, f"seed_{one.seed}")) if one.run_dir is not None else None
+    return [_as_saved(one, overrides) for one in with_seeds]
 
 
 def train(

@@ -5,7 +5,6 @@
 
 import dataclasses
 import functools
-import os
 import re
 import sys
 from pathlib import Path
@@ -21,6 +20,7 @@ from mjx_walk.utils import cli
 from mjx_walk.utils.devices import count_devices
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import user_path
+from mjx_walk.utils.nvidia import warn_of_unused_gpu
 from mjx_walk.utils.settings import setting
 from mjx_walk.utils.signals import exit_code
 
@@ -71,6 +71,8 @@ def main(command_line: list[str]) -> int:
         raise UserError(f"out={arguments.out} is a file; give a folder")
     seeds = cli.read_seeds(arguments.seeds)
     hardware, available = count_devices()
+    if hardware == "cpu":
+        warn_of_unused_gpu()
     count = arguments.devices or available
     if count > available:
         raise UserError(f"devices={count}: this machine has {available}; leave it out to use all")
@@ -118,7 +120,7 @@ def _on_end(out: Path, run: PlannedRun, log: Path) -> None:
 
 def _reason(log: Path) -> str:
     """Why a job has ended: the line of its error, or of its exception."""
-    text = log.read_text(errors="replace")[-10_000:]
+    text = log.read_text(encoding="utf-8", errors="replace")[-10_000:]
     if "RESOURCE_EXHAUSTED" in text:
         return ": memory ran out, so try together=1 or a smaller num_envs"
     found = re.findall(r"^(?:error: (.+)|([\w.]+(?:Error|Exception)\b.*))$", text, re.MULTILINE)
@@ -128,7 +130,7 @@ def _reason(log: Path) -> str:
 def _print_report(out: Path) -> None:
     report = write_report(out)
     print(report.read_text(encoding="utf-8"), end="")
-    print(f"Written: {os.path.relpath(report)}, and .png and .csv of the same name")
+    print(f"Written: {report}, and .png and .csv of the same name")
 
 
 if __name__ == "__main__":

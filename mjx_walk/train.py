@@ -1,11 +1,13 @@
 """`python -m mjx_walk.train env=humanoid algo=ppo`: train one run, or a sweep with `-m`."""
 
+import contextlib
 import dataclasses
 import os
 import sys
 import textwrap
 import traceback
 import typing
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ from mjx_walk.runs.config import (
 )
 from mjx_walk.runs.overrides import complete_overrides, key_of_value
 from mjx_walk.runs.renamed import present_overrides
+from mjx_walk.runs.run_folder import new_folder
 from mjx_walk.training import launcher
 from mjx_walk.training.distributed import Processes, join_processes
 from mjx_walk.utils import cli
@@ -178,14 +181,33 @@ def _through_hydra(arguments: list[str]) -> None:
     check([str(o.input_line) for o in plain])
     if {"-m", "--multirun"} & {*flags} and {"-c", "--cfg", "-i", "--info"} & {*flags}:
         raise UserError("-m trains a sweep and --cfg prints a configuration: give one of them")
-    sys.argv = [sys.argv[0], *flags, *overrides]  # Hydra wants all overrides together
     os.environ["HYDRA_FULL_ERROR"] = "1"
     register_schemas()
+    with _sweep_folder(flags, [override.key_or_group for override in parsed]) as folder:
+        sys.argv = [sys.argv[0], *flags, *overrides, *folder]  # Hydra wants all overrides together
+        try:
+            hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")(_sweep_job)()
+        except HydraException as error:
+            what, _, _ = str(error).partition("Config search path")
+            raise UserError(" ".join(what.split())) from error
+
+
+@contextlib.contextmanager
+def _sweep_folder(flags: list[str], keys: list[str]) -> Iterator[list[str]]:
+    """Context manager that creates the folder of a sweep, and yields Hydra's override for it.
+
+    Hydra alone would give two sweeps of the same second one folder. If the sweep fails early, the folder is removed.
+    """
+    if not {"-m", "--multirun"} & {*flags} or "hydra.sweep.dir" in keys:
+        yield []
+        return
+    folder = new_folder(Path("runs", "sweeps"))
     try:
-        hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")(_sweep_job)()
-    except HydraException as error:
-        what, _, _ = str(error).partition("Config search path")
-        raise UserError(" ".join(what.split())) from error
+        yield [f"hydra.sweep.dir={folder}"]
+    finally:
+        with contextlib.suppress(OSError):  # a folder is not empty
+            for path in (folder, *folder.parents[:2]):
+                path.rmdir()
 
 
 def _sweep_job(node: DictConfig) -> None:

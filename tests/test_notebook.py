@@ -1,7 +1,9 @@
 """The notebook runs from its first cell to its last, and is kept without outputs."""
 
+import contextlib
 import re
 import sys
+import types
 from pathlib import Path
 
 import nbformat
@@ -20,30 +22,47 @@ def test_outputs_are_stripped():
 WHEEL = "mjx_walk-1.0-py3-none-any.whl"
 
 
-@pytest.mark.parametrize("has_gpu", [False, True])
-@pytest.mark.parametrize(
-    ("source", "in_clone", "installed"),
-    [
-        (WHEEL, False, "{source}{extra}"),
-        (f"https://example.org/{WHEEL}", False, "mjx-walk{extra} @ {source}"),
-        ("https://example.org/mjx_walk", False, "mjx-walk{extra} @ git+{source}"),
-        ("", True, "..{extra}"),
-    ],
-)
-def test_the_first_cell_installs_the_package(tmp_path, monkeypatch, source, in_clone, installed, has_gpu):
-    ran = run_first_cell(tmp_path, monkeypatch, source, in_clone, has_gpu)
-    expected = installed.format(source=source, extra="[cuda]" if has_gpu else "")
+SOURCES = [
+    (WHEEL, False, "{source}{extra}"),
+    (f"https://example.org/{WHEEL}", False, "mjx-walk{extra} @ {source}"),
+    ("https://example.org/mjx_walk", False, "mjx-walk{extra} @ git+{source}"),
+    ("", True, "..{extra}"),
+]
+DRIVERS = [(None, ""), ("580.95.05", "[cuda]"), ("550.54.14", "[cuda12]"), ("470.1", "")]
+
+
+@pytest.mark.parametrize(("driver", "extra"), DRIVERS)
+@pytest.mark.parametrize(("source", "in_clone", "installed"), SOURCES)
+def test_the_first_cell_installs_what_the_driver_supports(
+    tmp_path, monkeypatch, source, in_clone, installed, driver, extra
+):
+    ran = run_first_cell(tmp_path, monkeypatch, source, in_clone, driver)
+    expected = installed.format(source=source, extra=extra)
     assert ran == [[sys.executable, "-m", "pip", "install", "--quiet", expected]]
     if "@" in expected:
         assert Requirement(expected).name == "mjx-walk"
 
 
+def test_the_first_cell_keeps_to_the_cuda_that_is_installed(tmp_path, monkeypatch):
+    ran = run_first_cell(tmp_path, monkeypatch, WHEEL, False, "580.95.05", has_cuda_12=True)
+    assert ran[0][-1] == f"{WHEEL}[cuda12]"
+
+
 def test_the_first_cell_says_what_it_needs(tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match="Set SOURCE above to mjx_walk's wheel"):
-        run_first_cell(tmp_path, monkeypatch, "", in_clone=False, has_gpu=False)
+        run_first_cell(tmp_path, monkeypatch, "", in_clone=False)
 
 
-def run_first_cell(tmp_path, monkeypatch, source, in_clone, has_gpu):
+@pytest.mark.parametrize(("uploaded", "ends"), [({WHEEL: b""}, False), ({"other.txt": b""}, True), ({}, True)])
+def test_colab_asks_for_the_wheel(tmp_path, monkeypatch, uploaded, ends):
+    colab = types.ModuleType("google.colab")
+    colab.files = types.SimpleNamespace(upload=lambda: uploaded)
+    monkeypatch.setitem(sys.modules, "google.colab", colab)
+    with pytest.raises(SystemExit) if ends else contextlib.nullcontext():
+        assert run_first_cell(tmp_path, monkeypatch, "", in_clone=False)[0][-1] == WHEEL
+
+
+def run_first_cell(tmp_path, monkeypatch, source, in_clone, driver=None, has_cuda_12=False):
     """Run it as if mjx_walk were not installed. Returns the commands that it would run."""
     cell = next(cell for cell in nbformat.read(NOTEBOOK, as_version=4).cells if cell.cell_type == "code")
     (tmp_path / "notebooks").mkdir()
@@ -51,9 +70,16 @@ def run_first_cell(tmp_path, monkeypatch, source, in_clone, has_gpu):
         (tmp_path / "pyproject.toml").touch()
     monkeypatch.chdir(tmp_path / "notebooks")
     ran = []
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/nvidia-smi" if has_gpu else None)
-    monkeypatch.setattr("subprocess.run", lambda command, check: ran.append(command))
+
+    def run(command, **options):
+        if command[0] != "nvidia-smi":
+            return ran.append(command)
+        if driver is None:
+            raise FileNotFoundError
+        return types.SimpleNamespace(stdout=f"{driver}\n")
+
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: ("jax" in name and has_cuda_12) or None)
+    monkeypatch.setattr("subprocess.run", run)
     exec(cell.source.replace('SOURCE = ""', f"SOURCE = {source!r}"), {})
     return ran
 

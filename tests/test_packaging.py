@@ -1,5 +1,8 @@
 """The package works editable, from a wheel or sdist, next to a clone, and from a clone."""
 
+import ast
+import importlib.metadata
+import itertools
 import os
 import re
 import shutil
@@ -48,6 +51,34 @@ def test_constraints_allow_what_the_package_needs(python):
     project = tomllib.loads((CLONE / "pyproject.toml").read_text())["project"]
     for requirement in map(Requirement, (*project["dependencies"], *project["optional-dependencies"]["warp"])):
         assert requirement.specifier.contains(versions[requirement.name.lower()]), requirement
+
+
+def test_every_import_is_declared():
+    """What the package imports from elsewhere is a dependency, or belongs to an extra for users."""
+    project = tomllib.loads((CLONE / "pyproject.toml").read_text())["project"]
+    extras = {name: needed for name, needed in project["optional-dependencies"].items() if name not in ("dev", "docs")}
+    requirements = [Requirement(line) for line in (*project["dependencies"], *itertools.chain(*extras.values()))]
+    declared = {_as_name(requirement.name) for requirement in requirements}
+    distributions = importlib.metadata.packages_distributions()
+    modules = {name.partition(".")[0] for name in _imports() if name}
+    elsewhere = modules - {*sys.stdlib_module_names, "mjx_walk"}
+    assert {"jax", "tensorstore", "warp"} < elsewhere
+    undeclared = {name for name in elsewhere if not declared & {*map(_as_name, distributions.get(name, ()))}}
+    assert not undeclared
+
+
+def _imports():
+    """Names of all modules that the package imports."""
+    for path in (*CLONE.glob("mjx_walk/**/*.py"), *CLONE.glob("envs/**/*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                yield from (alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                yield node.module
+
+
+def _as_name(distribution):
+    return re.sub(r"[-_.]+", "-", distribution).lower()
 
 
 @pytest.fixture(scope="module")

@@ -5,14 +5,16 @@ Observations, rewards and episodes do not.
 """
 
 import importlib.util
+import warnings
 
 import mujoco
 
 from mjx_walk.envs.physics.base import Derived, Engine, PhysicsState
 from mjx_walk.envs.physics.preparation import nothing_runs
 from mjx_walk.envs.physics.supported import refuse_unsupported, unsupported_by_mjx, warn_of_approximations
-from mjx_walk.utils.devices import default_device
+from mjx_walk.utils.devices import default_backend, default_device
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.nvidia import Machine, installed_version, warn_of_unused_gpu, warp_misfit
 
 ENGINES = ("warp", "jax", "c")
 
@@ -23,24 +25,33 @@ def resolve_engine(name: str) -> str:
     """Name of the engine to use on JAX's default device.
 
     Args:
-        name: name of an engine, or `auto`: `c` on a CPU, `warp` on an NVIDIA GPU if Warp is installed, `jax` on any
-            other accelerator.
+        name: name of an engine, or `auto`: `c` on a CPU, `warp` on an NVIDIA GPU if Warp is installed and supports
+            its driver, `jax` on any other accelerator.
 
     Raises:
-        UserError: an unknown name, `warp` without Warp installed, or `c` on an accelerator.
+        UserError: an unknown name, `warp` without Warp installed or with a driver that is too old, or `c` on an
+            accelerator.
     """
+    default_backend()  # says in one line why JAX does not start
     device = default_device()
     platform = device.platform
+    if name != "c":
+        warn_of_unused_gpu()
     has_warp = importlib.util.find_spec("warp") is not None
+    is_nvidia = platform == "gpu" and "nvidia" in device.device_kind.lower()
+    misfit = warp_misfit(Machine.seen(), installed_version("warp-lang")) if is_nvidia and has_warp else None
     if name == "auto":
         if platform == "cpu":
             return "c"
-        is_nvidia = platform == "gpu" and "nvidia" in device.device_kind.lower()
-        return "warp" if is_nvidia and has_warp else "jax"
+        if misfit:
+            warnings.warn(f"physics=jax in place of Warp: {misfit}", stacklevel=2)
+        return "warp" if is_nvidia and has_warp and not misfit else "jax"
     if name not in ENGINES:
         raise UserError(f"unknown physics '{name}'; choose one of: auto, {', '.join(ENGINES)}")
     if name == "warp" and not has_warp:
         raise UserError("physics=warp needs Warp: install it with pip install 'mjx-walk[warp]', or use physics=jax")
+    if name == "warp" and misfit:
+        raise UserError(f"physics=warp: {misfit}, or use physics=jax")
     if name == "c" and platform != "cpu":
         raise UserError(f"physics=c runs on the CPU, but JAX uses a {platform}; set JAX_PLATFORMS=cpu, or use auto")
     return name

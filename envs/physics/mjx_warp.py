@@ -18,7 +18,7 @@ from mjx_walk.envs.physics import capsule_frames_warp
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.mjx_model import check_derived, read_derived, with_newton_solver
 from mjx_walk.envs.physics.preparation import Preparation
-from mjx_walk.envs.physics.warp_kernels import load_kernels
+from mjx_walk.envs.physics.warp_kernels import choose_cache, load_kernels
 from mjx_walk.utils.devices import default_device
 
 CONTACTS_PER_ENV = 40
@@ -43,6 +43,7 @@ class WarpEngine:
     calls_host = False
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
+        choose_cache()
         capsule_frames_warp.install()
         # On a CPU, this hides Warp's warning about a missing GPU.
         wp.config.log_level = wp.LOG_ERROR if jax.default_backend() == "cpu" else wp.LOG_WARNING

@@ -1,18 +1,26 @@
 """Kernels of MuJoCo Warp, compiled in parallel before a step needs them. The step would compile one after the other."""
 
+import atexit
 import contextlib
 import logging
 import math
+import os
+import shutil
+import tempfile
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import mujoco
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
+
+from mjx_walk.utils.files import is_writable_folder, user_folder
 
 _log = logging.getLogger("mjx_walk.progress")
 
@@ -22,6 +30,25 @@ _NUM_THREADS = 8
 
 Variants = dict[wp.Module, set[int | None]]
 """The block sizes by module with which its kernels are launched; None is the module's own."""
+
+
+def choose_cache() -> None:
+    """Have Warp keep its kernels until this process ends, where the user's cache folder is missing or read-only.
+
+    Warp would create a folder named `~` in the working directory, or fail. A folder that the user has chosen stays.
+    Call this function before Warp starts.
+    """
+    if wp.config.kernel_cache_dir or "WARP_CACHE_PATH" in os.environ:
+        return
+    folder = user_folder("XDG_CACHE_HOME", ".cache")
+    if folder and is_writable_folder(folder / "warp"):
+        return
+    folder = Path(tempfile.mkdtemp(prefix="warp_"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    wp.config.kernel_cache_dir = str(folder)
+    warnings.warn(
+        "Warp's kernels are not kept: there is no cache folder to write to; set WARP_CACHE_PATH", stacklevel=2
+    )
 
 
 def load_kernels(model: mujoco.MjModel, njmax: int, device: wp.Device) -> list[Future]:

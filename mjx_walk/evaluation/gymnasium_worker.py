@@ -13,6 +13,10 @@ from typing import IO, Any
 
 import numpy as np
 
+from mjx_walk.utils.streams import open_standard_streams
+
+_STDOUT, _STDERR = 1, 2
+
 
 def serve() -> None:
     """Serve one parent.
@@ -20,9 +24,10 @@ def serve() -> None:
     Raises:
         EOFError, BrokenPipeError: the parent has closed the pipes.
     """
+    open_standard_streams()
     # A library's prints must not end up between the pickles, so they go to stderr.
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    answers = os.fdopen(os.dup(_STDOUT), "wb")
+    os.dup2(_STDERR, _STDOUT)
     warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
     import gymnasium
 

@@ -204,7 +204,7 @@ def start_job(job: list[PlannedRun], log: Path, device: int | None, share: int, 
     log.parent.mkdir(parents=True, exist_ok=True)
     if log.is_file() and log.stat().st_nlink > 1:  # it is also another file, which must not grow
         log.unlink()
-    with os.fdopen(open_to_append(log), "a") as file:
+    with os.fdopen(open_to_append(log), "ab") as file:
         return start_module("train", *arguments, env=env, stdout=file, stderr=subprocess.STDOUT, pass_fds=(lock,))
 
 

@@ -72,7 +72,7 @@ def training(
         run_dir, output = Path(folder, "run"), Path(folder, "output.txt")
         arguments = [*overrides, "evaluation.gymnasium_episodes=0", f"run_dir={run_dir}"]
         with (
-            output.open("w") as file,
+            output.open("wb") as file,
             start_module("train", *arguments, env=with_parent() | (env or {}), stdout=file, stderr=STDOUT) as process,
         ):
             hangs = False
@@ -83,10 +83,11 @@ def training(
         if are_enough(rows):
             yield rows, run_dir
             return
+        printed = output.read_text(encoding="utf-8", errors="replace")
         if process.returncode == 2:
-            raise UserError(output.read_text().splitlines()[-1].removeprefix("error: "))
+            raise UserError(printed.splitlines()[-1].removeprefix("error: "))
         end = f"no row for {_limit(rows):.0f} s" if hangs else f"exit code {process.returncode}"
-        raise RuntimeError(f"train {' '.join(arguments)}: {output.read_text()}{end}")
+        raise RuntimeError(f"train {' '.join(arguments)}: {printed}{end}")
 
 
 def _wait_for_rows(metrics: Path, are_enough: Callable[[list[Row]], bool], process: Popen) -> tuple[list[Row], bool]:

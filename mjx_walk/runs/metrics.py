@@ -158,7 +158,7 @@ def write_csv(rows: list[Row], path: Path) -> Path:
     """
     names = list(dict.fromkeys(name for row in rows for name in row))
     most = max(_MAX_CELLS // max(len(rows), 1), 1)
-    with replacing(path) as new, new.open("w", newline="") as file:
+    with replacing(path) as new, new.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names[:most], extrasaction="ignore")
         writer.writeheader()
         writer.writerows({name: _as_cell(value) for name, value in row.items()} for row in rows)

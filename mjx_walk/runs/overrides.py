@@ -6,7 +6,6 @@ import re
 import typing
 from collections.abc import Collection
 
-import jax
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override, Quote, QuotedString, Sweep
 from hydra.errors import HydraException
@@ -17,6 +16,7 @@ from mjx_walk.runs.own_tasks import KEY, name_task
 from mjx_walk.runs.recipes import base_recipe
 from mjx_walk.runs.renamed import present_overrides
 from mjx_walk.runs.schema import chosen, setting_types
+from mjx_walk.utils.devices import default_backend
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.near_misses import unknown
 from mjx_walk.utils.value_types import plain_type, with_whole_number
@@ -60,7 +60,7 @@ def complete_overrides(overrides: list[str], is_sweep: bool = False) -> list[str
                 raise UserError(unknown(key, value, known))
     overrides = [str(override.input_line) for override in parsed]
     if not any(override.key_or_group == "hardware" for override in parsed):
-        overrides = [f"hardware={'cpu' if jax.default_backend() == 'cpu' else 'gpu'}", *overrides]
+        overrides = [f"hardware={'cpu' if default_backend() == 'cpu' else 'gpu'}", *overrides]
     return _with_recipe(overrides)
 
 

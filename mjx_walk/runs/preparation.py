@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mjx_walk.runs.checkpoint import list_steps
 from mjx_walk.runs.config import Config
-from mjx_walk.runs.run_folder import RunFolder, new_path, open_existing
+from mjx_walk.runs.run_folder import RunFolder, new_folder, open_existing
 from mjx_walk.runs.saved_config import differences, in_short, name_same_file, read_saved_config, save_config
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import is_unfinished, refuse_links, sync
@@ -25,7 +25,8 @@ def prepared(configs: list[Config]) -> Iterator[tuple[list[RunFolder], list[Conf
     All folders are checked before the first one is created, and again under their locks.
 
     Args:
-        configs: configurations of the runs, which may differ in `seed` and `run_dir`.
+        configs: configurations of the runs, which may differ in `seed` and `run_dir`. Without `run_dir`, a new folder
+            gets their runs.
 
     Yields:
         The folders, and the configurations with `run_dir` filled in.
@@ -38,7 +39,9 @@ def prepared(configs: list[Config]) -> Iterator[tuple[list[RunFolder], list[Conf
     if first.run_dir is None:
         if first.resume:
             raise UserError("resume=true needs run_dir=PATH of the run to continue")
-        configs = [dataclasses.replace(config, run_dir=str(new_path(config))) for config in configs]
+        new = new_folder(Path("runs", f"{first.env.name}_{first.algo.name}"))
+        paths = [new if len(configs) == 1 else new / f"seed_{config.seed}" for config in configs]
+        configs = [dataclasses.replace(config, run_dir=str(path)) for config, path in zip(configs, paths, strict=True)]
     folders = [RunFolder(Path(str(config.run_dir))) for config in configs]
     if len(folders) > 1:  # the user has named only the folder above them
         for folder in folders:

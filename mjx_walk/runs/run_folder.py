@@ -1,5 +1,6 @@
 """The folder of a run: its paths, and the checks before a command reads it."""
 
+import contextlib
 import dataclasses
 import datetime
 import os
@@ -7,12 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mjx_walk.runs.checkpoint import config_copy, find, list_steps
-from mjx_walk.runs.config import Config
 from mjx_walk.runs.scores import BEST, FINAL
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.files import user_path
 
-__all__ = ["RunFolder", "new_path", "open_existing"]
+__all__ = ["RunFolder", "new_folder", "open_existing"]
+
+_MOST_IN_A_SECOND = 10_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,10 +77,25 @@ class RunFolder:
                 yield path
 
 
-def new_path(config: Config) -> Path:
-    """The default folder of a new run."""
+def new_folder(above: Path) -> Path:
+    """Create a folder named by the time, and by a number if another process has created one in the same second.
+
+    Args:
+        above: the folder that holds it, created if it does not exist.
+
+    Raises:
+        UserError: the folder cannot be created.
+    """
     now = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    return Path("runs") / f"{config.env.name}_{config.algo.name}" / now
+    try:
+        above.mkdir(parents=True, exist_ok=True)
+        for suffix in ("", *(f"_{number}" for number in range(2, _MOST_IN_A_SECOND))):
+            with contextlib.suppress(FileExistsError):
+                (above / f"{now}{suffix}").mkdir()
+                return above / f"{now}{suffix}"
+    except OSError as error:
+        raise UserError(f"cannot write to {above}: {error.strerror}; give run_dir=PATH of another folder") from error
+    raise UserError(f"{above} has {_MOST_IN_A_SECOND} runs of this second; give run_dir=PATH")
 
 
 def open_existing(path: str | Path | None) -> RunFolder:

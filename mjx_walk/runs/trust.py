@@ -13,7 +13,7 @@ from typing import Any
 
 from mjx_walk.envs.user_files import changed_file, only_known, source_path
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import write_text
+from mjx_walk.utils.files import user_folder, write_text
 
 __all__ = ["remember", "require_trusted", "trust_file"]
 
@@ -23,11 +23,13 @@ Trusted = dict[str, dict[str, str]]
 """For each `PATH.py:NAME`, the SHA-256 of the file and of its helpers, by absolute path."""
 
 
-def trust_file() -> Path:
-    """Path of the list: `mjx_walk/trusted_reward_functions.json` in `$XDG_CONFIG_HOME`, by default `~/.config`."""
-    base = os.environ.get("XDG_CONFIG_HOME", "")
-    folder = Path(base) if os.path.isabs(base) else Path("~/.config").expanduser()
-    return folder / "mjx_walk" / "trusted_reward_functions.json"
+def trust_file() -> Path | None:
+    """Path of the list: `mjx_walk/trusted_reward_functions.json` in `$XDG_CONFIG_HOME`, by default `~/.config`.
+
+    None if the user has no home folder.
+    """
+    folder = user_folder("XDG_CONFIG_HOME", ".config")
+    return folder / "mjx_walk" / "trusted_reward_functions.json" if folder else None
 
 
 def remember(source: str, hashes: Mapping[str, str], key: str = "env.reward_function") -> None:
@@ -42,6 +44,9 @@ def remember(source: str, hashes: Mapping[str, str], key: str = "env.reward_func
     if trusted is None or trusted.get(source) == hashes:
         return
     path = trust_file()
+    if path is None:
+        _LOGGER.warning("no home folder: set HOME or XDG_CONFIG_HOME, or a resume needs %s", _named(key, source))
+        return
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         write_text(path, json.dumps(trusted | {source: dict(hashes)}, indent=1), mode=0o600)
@@ -78,6 +83,8 @@ def _named(key: str, source: str) -> str:
 def _read() -> Trusted | None:
     """The list. None, and a warning, if there is a file that is not such a list."""
     path = trust_file()
+    if path is None:
+        return {}
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):

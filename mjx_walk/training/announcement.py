@@ -27,7 +27,7 @@ def announce(config: Config, folders: list[RunFolder], num_devices: int) -> None
     _LOGGER.info("Training %s with %s on %s, physics=%s, in %s", env, algo.name, where, config.physics, path)
     if config.hardware == "cpu":
         _LOGGER.info(
-            "No accelerator: this is the recipe for a CPU. By default the physics is MuJoCo's C library. "
+            "JAX runs on the CPU: this is the recipe for a CPU. By default the physics is MuJoCo's C library. "
             "Expect a gait after minutes to tens of minutes; recipes for a GPU reach much higher scores."
         )
     if algo.learning_rate_schedule != "constant" and config.total_steps > algo.schedule_steps:

@@ -61,7 +61,7 @@ def run(arguments: list[str], size: int) -> int:
         if interrupt.signal_name:
             return exit_code(interrupt.signal_name)
         if rank:
-            output = _log_file(Path(logs), rank).read_text(errors="replace")
+            output = _log_file(Path(logs), rank).read_text(encoding="utf-8", errors="replace")
             _log.error(f"the output of device {rank} ends with:\n{output[-2000:]}")
         if code != 2:  # with code 2 the process has printed its own error
             _log.error(
@@ -78,7 +78,7 @@ def _start(arguments: list[str], size: int, logs: Path) -> list[subprocess.Popen
     processes = []
     for rank in range(size):
         env = os.environ | {"MJX_WALK_PROCESS": f"{rank},{size},{coordinator}"} | only_device(rank)
-        with _log_file(logs, rank).open("w") as log:
+        with _log_file(logs, rank).open("wb") as log:
             output = log if rank else None
             processes.append(
                 subprocess.Popen(

@@ -5,7 +5,6 @@ Invalid input prints a one-line error and exits with code 2.
 
 import dataclasses
 import difflib
-import errno
 import functools
 import itertools
 import re
@@ -29,6 +28,7 @@ from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.settings import MAX_SEED, validate
 from mjx_walk.utils.signals import Stopped, exit_code, ignore_at_exit
 from mjx_walk.utils.subprocesses import end_with_parent
+from mjx_walk.utils.surroundings import check_surroundings, correctable
 from mjx_walk.utils.text import printable
 from mjx_walk.utils.value_types import plain_type, type_mistake, with_whole_number
 from mjx_walk.utils.versions import __version__
@@ -223,9 +223,6 @@ def stay_on_cpu() -> None:
     jax.config.update("jax_platforms", "cpu")
 
 
-_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP)
-
-
 def main(command: Callable[[list[str]], int | None]) -> NoReturn:
     """Run a command on the arguments of this process, and exit with its exit code.
 
@@ -246,6 +243,7 @@ def _exit_code_of(command: Callable[[list[str]], int | None]) -> int:
         return 0
     try:
         try:
+            check_surroundings(sys.argv[1:])
             return command(sys.argv[1:]) or 0
         finally:
             sys.stdout.flush()  # here, where a full disk is reported
@@ -253,9 +251,10 @@ def _exit_code_of(command: Callable[[list[str]], int | None]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
-        if error.errno not in _DISK_ERRORS:
+        reason = correctable(error)
+        if not reason:
             raise
-        print(f"error: {printable(str(error))}", file=sys.stderr)
+        print(f"error: {printable(reason)}", file=sys.stderr)
         return 2
     except Stopped as stopped:
         print(f"Stopped by {stopped.signal_name}.", file=sys.stderr)

@@ -10,6 +10,8 @@ from pathlib import Path
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+from mjx_walk.utils.files import is_writable_folder, user_folder
+
 __all__ = [
     "default_cache_dir",
     "exempt_imports_from_gc",
@@ -94,7 +96,13 @@ def temporary_jax_settings(matmul_precision: str) -> Iterator[None]:
         if has_cache:
             yield
             return
-        _set_cache_dir(str(default_cache_dir()))
+        folder = default_cache_dir()
+        if not (folder and is_writable_folder(folder)):
+            where = f"{folder} cannot be written" if folder else "there is no home folder"
+            warnings.warn(f"compiled programs are not kept: {where}; set JAX_COMPILATION_CACHE_DIR", stacklevel=3)
+            yield
+            return
+        _set_cache_dir(str(folder))
         try:
             yield
         finally:
@@ -107,9 +115,10 @@ def _set_cache_dir(path: str | None) -> None:
     jax.config.update("jax_compilation_cache_dir", path)
 
 
-def default_cache_dir() -> Path:
-    """The folder of compiled programs, below the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "mjx_walk" / "jax"
+def default_cache_dir() -> Path | None:
+    """The folder of compiled programs, below the user's cache folder. None if the user has no home folder."""
+    folder = user_folder("XDG_CACHE_HOME", ".cache")
+    return folder / "mjx_walk" / "jax" if folder else None
 
 
 def exempt_imports_from_gc() -> None:

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator
 from typing import IO, Any
 
+from mjx_walk.utils.streams import open_standard_streams
 from mjx_walk.utils.text import printable
 
 __all__ = ["console"]
@@ -23,7 +24,7 @@ class _Output:
         Args:
             stream: what to write to; None where the process was started with a closed stream.
         """
-        self._stream: Any = stream or open(os.devnull, "w")  # noqa: SIM115  # until the process ends
+        self._stream: Any = stream or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # until the process ends
         if hasattr(self._stream, "reconfigure"):
             self._stream.reconfigure(errors="backslashreplace")  # an encoding may lack letters
 
@@ -86,6 +87,11 @@ class _OneLineOnce:
         return text
 
 
+def _is_not_about_gpus(record: logging.LogRecord) -> bool:
+    """Whether a message of JAX is not the one of a GPU that it does not use; `utils.nvidia` says why and what to do."""
+    return not record.getMessage().startswith(("An NVIDIA GPU may be present", "CUDA backend failed to initialize"))
+
+
 def _say_nothing_of_interrupts(unraisable: Any) -> None:
     """Hide a Ctrl-C that meets code which cannot raise, such as a callback of the garbage collector."""
     if not (unraisable.exc_type and issubclass(unraisable.exc_type, KeyboardInterrupt)):
@@ -95,6 +101,7 @@ def _say_nothing_of_interrupts(unraisable: Any) -> None:
 @contextlib.contextmanager
 def console() -> Iterator[None]:
     """Show this package's log messages, format warnings in one line, and outlive the reader of the output."""
+    open_standard_streams()
     logger, handler = logging.getLogger("mjx_walk"), _Handler()
     level, propagate, format_warning = logger.level, logger.propagate, warnings.formatwarning
     stdout, stderr = sys.stdout, sys.stderr
@@ -105,6 +112,8 @@ def console() -> Iterator[None]:
     logger.propagate = False  # other libraries may have added handlers to the root logger
     warnings.formatwarning = _OneLineOnce()  # type: ignore[assignment]
     unraisable_hook, sys.unraisablehook = sys.unraisablehook, _say_nothing_of_interrupts
+    jax_logger = logging.getLogger("jax._src.xla_bridge")
+    jax_logger.addFilter(_is_not_about_gpus)
     try:
         yield
     finally:
@@ -116,3 +125,4 @@ def console() -> Iterator[None]:
         logger.propagate = propagate
         warnings.formatwarning = format_warning
         sys.unraisablehook = unraisable_hook
+        jax_logger.removeFilter(_is_not_about_gpus)

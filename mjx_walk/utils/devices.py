@@ -10,6 +10,21 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.subprocesses import python
 
 
+def default_backend() -> str:
+    """Name of JAX's default backend, such as `cpu` or `gpu`.
+
+    Raises:
+        UserError: JAX does not start, for example because `JAX_PLATFORMS` names what this machine does not have.
+    """
+    try:
+        return jax.default_backend()
+    except (RuntimeError, AssertionError) as error:
+        chosen = jax.config.jax_platforms  # type: ignore[attr-defined]
+        asked = f" with JAX_PLATFORMS={chosen}" if chosen else ""
+        reason = " ".join(str(error).split()) or "there is no such device; unset it, or set JAX_PLATFORMS=cpu"
+        raise UserError(f"JAX does not start{asked}: {reason}") from error
+
+
 def count_devices() -> tuple[str, int]:
     """`gpu` or `cpu`, and the number of devices. A CPU counts as one.
 
@@ -19,7 +34,7 @@ def count_devices() -> tuple[str, int]:
         UserError: JAX does not start.
     """
     code = "import jax; print(jax.default_backend() != 'cpu', jax.local_device_count())"
-    done = subprocess.run([*python(), "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run([*python(), "-c", code], capture_output=True, encoding="utf-8", errors="replace", check=False)
     if done.returncode:
         raise UserError(f"JAX does not start: {done.stderr.strip().splitlines()[-1]}")
     is_gpu, count = done.stdout.split()[-2:]

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import pwd
 import re
 import secrets
 import stat
@@ -18,6 +19,7 @@ __all__ = [
     "check_replaceable",
     "fresh_name",
     "is_unfinished",
+    "is_writable_folder",
     "open_to_append",
     "open_to_read",
     "read_bytes",
@@ -25,6 +27,7 @@ __all__ = [
     "replacing",
     "sync",
     "sync_tree",
+    "user_folder",
     "user_path",
     "write_text",
 ]
@@ -47,6 +50,37 @@ def user_path(path: str | Path) -> Path:
         return Path(text).expanduser()
     except RuntimeError as error:
         raise UserError(f"'{text}': there is no such home folder; for a folder of this name write ./{text}") from error
+
+
+def user_folder(variable: str, below_home: str) -> Path | None:
+    """A folder of the user for one kind of files, as the XDG Base Directory Specification says.
+
+    Args:
+        variable: environment variable that names it, such as `XDG_CACHE_HOME`. A relative path there is ignored.
+        below_home: name of the default folder in the user's home.
+
+    Returns:
+        The path, or None if the user has no home.
+    """
+    base = os.environ.get(variable, "")
+    if os.path.isabs(base):
+        return Path(base)
+    home = os.environ.get("HOME", "")
+    if not home:
+        try:
+            home = pwd.getpwuid(os.getuid()).pw_dir
+        except KeyError:
+            return None
+    return Path(home, below_home) if os.path.isabs(home) else None
+
+
+def is_writable_folder(folder: Path) -> bool:
+    """Whether a folder can be written. It is created if it does not exist."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK | os.X_OK)
 
 
 @contextlib.contextmanager

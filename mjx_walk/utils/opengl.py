@@ -1,10 +1,12 @@
-"""What OpenGL this machine has, and MuJoCo's import where `MUJOCO_GL` does not work: only rendering needs OpenGL.
+"""What OpenGL this machine has, and MuJoCo's import where `MUJOCO_GL` does not work or a standard stream is closed.
 
 This module does not import JAX.
 """
 
 import os
 import sys
+
+from mjx_walk.utils.streams import with_standard_streams
 
 __all__ = ["has_screen", "import_mujoco"]
 
@@ -18,11 +20,19 @@ def import_mujoco() -> None:
     """Import MuJoCo without OpenGL if `MUJOCO_GL` is invalid, or names a library that is missing.
 
     MuJoCo's own import fails then. `viewing.rendering.choose_opengl` reports such a value when something is rendered.
-    Without `MUJOCO_GL` this function does nothing: the first module that needs MuJoCo imports it.
+    Without `MUJOCO_GL` this function does nothing: the first module that needs MuJoCo imports it. It does import MuJoCo
+    where a standard stream is closed. GLFW, which MuJoCo imports, starts a child process that needs all of them.
     """
     chosen = os.environ.get("MUJOCO_GL")
-    if not chosen:
-        return
+    with with_standard_streams() as are_needed:
+        if chosen:
+            _import_with(chosen)
+        elif are_needed:
+            import mujoco  # noqa: F401
+
+
+def _import_with(chosen: str) -> None:
+    """Import MuJoCo with a value of `MUJOCO_GL`, and without OpenGL if that fails."""
     try:
         import mujoco
     except Exception:  # each library fails with another type

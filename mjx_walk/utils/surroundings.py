@@ -1,0 +1,56 @@
+"""What a command needs of the system around it: a working folder, text that can be written, and disks."""
+
+import errno
+import os
+import sys
+
+from mjx_walk.utils.errors import UserError
+
+__all__ = ["check_surroundings", "correctable"]
+
+_NO_FOLDER = "the working folder was deleted; change to another one, for example with cd ~"
+_DISK_ERRORS = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
+    *(errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP),
+)
+
+
+def check_surroundings(arguments: list[str]) -> None:
+    """Check what no command works without: a working folder, and text that can be written to files.
+
+    Raises:
+        UserError: the working folder was deleted, or has a name that is no text in the locale's encoding, or an
+            argument is none.
+    """
+    try:
+        here = os.getcwd()
+    except FileNotFoundError:
+        raise UserError(_NO_FOLDER) from None
+    encoding = sys.getfilesystemencoding()
+    for name, text in (("the working folder", here), *(("the argument", argument) for argument in arguments)):
+        if not _is_text(text) and (encoding != "utf-8" or text == here):
+            shown = os.fsencode(text).decode("utf-8", errors="backslashreplace")
+            advice = "set PYTHONUTF8=1" if encoding != "utf-8" else "change to another folder"
+            raise UserError(f"{name} '{shown}' is no text in the encoding of this locale, {encoding}; {advice}")
+
+
+def _is_text(text: str) -> bool:
+    """Whether a text from the system could be decoded, so that it can be encoded again."""
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def correctable(error: OSError) -> str | None:
+    """What to print of an error that the user can correct, outside this package. None for others."""
+    if error.errno in _DISK_ERRORS:
+        return str(error)
+    if (error.strerror or "").startswith("No usable temporary directory"):
+        return "there is no folder for temporary files; set TMPDIR to one that can be written"
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return _NO_FOLDER
+    return None
