@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import functools
 import logging
-import operator
 import shlex
 import typing
 from collections.abc import Callable
@@ -17,7 +16,6 @@ from mjx_walk.algos import make_algorithm
 from mjx_walk.envs import BUILT_IN_TASKS, Task, register_task
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.envs.registry import task_name
-from mjx_walk.envs.user_files import only_known, source_path
 from mjx_walk.evaluation.gymnasium_scores import (
     Episodes,
     ScoreRequest,
@@ -33,12 +31,11 @@ from mjx_walk.runs.overrides import key_of_value
 from mjx_walk.runs.own_tasks import KEY
 from mjx_walk.runs.policies import SavedPolicy, make_task
 from mjx_walk.runs.preparation import prepared
-from mjx_walk.runs.renamed import present_key
+from mjx_walk.runs.resuming import as_saved
 from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.saved_config import read_saved_config, with_setting
 from mjx_walk.runs.saved_yaml import read_yaml
 from mjx_walk.runs.scores import BEST, Scores
-from mjx_walk.runs.trust import remember, require_trusted
+from mjx_walk.runs.trust import remember
 from mjx_walk.training.announcement import announce
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.memory_check import check_replay
@@ -60,8 +57,15 @@ class Run(SavedPolicy):
 
     @functools.cached_property
     def metrics(self) -> list[Row]:
-        """All rows of `metrics.jsonl`."""
-        return read_rows(self.path / "metrics.jsonl")
+        """All rows of `metrics.jsonl`; none for a policy of the zoo, which has no such file.
+
+        Raises:
+            UserError: the file is gone, or cannot be read.
+        """
+        path = RunFolder(self.path).metrics
+        if not path.exists() and not zoo.holds(self.path):
+            raise UserError(f"{path} is missing; restore it, or load the run from the folder that has it")
+        return read_rows(path)
 
     @standard_settings()
     def evaluate(self, episodes: int = 100, backend: str = "gymnasium", seed: int = 0) -> Scores:
@@ -126,7 +130,7 @@ def resolve(overrides: list[str]) -> Config:
     Raises:
         UserError: invalid overrides.
     """
-    return _as_saved(load_config(overrides), overrides)
+    return as_saved(load_config(overrides), overrides)
 
 
 def resolve_seeds(overrides: list[str], seeds: list[int]) -> list[Config]:
@@ -142,7 +146,7 @@ def resolve_seeds(overrides: list[str], seeds: list[int]) -> list[Config]:
         raise UserError("resume=true needs run_dir=PATH of the folder that holds the seeds")
     parent = Path(config.run_dir or run_folder.new_path(config))
     with_seeds = (dataclasses.replace(config, seed=seed, run_dir=str(parent / f"seed_{seed}")) for seed in seeds)
-    return [_as_saved(config, overrides) for config in with_seeds]
+    return [as_saved(config, overrides) for config in with_seeds]
 
 
 def train(
@@ -253,8 +257,15 @@ def run(
     refuse_flags(overrides, key_of_value, typing.get_type_hints(Config))
     if task is not None:
         overrides = _with_task(overrides, task)
-    folders, _ = train([resolve(overrides)], on_metrics)
+    folders, _ = train([_in_absolute_folder(resolve(overrides))], on_metrics)
     return load_run(folders[0].path)
+
+
+def _in_absolute_folder(config: Config) -> Config:
+    """A configuration whose run folder stays the same one if the program changes its working directory."""
+    if config.run_dir is None and config.resume:
+        return config  # refused later
+    return dataclasses.replace(config, run_dir=str(Path(config.run_dir or run_folder.new_path(config)).absolute()))
 
 
 def _with_task(overrides: list[str], task: type[Task]) -> list[str]:
@@ -267,28 +278,3 @@ def _with_task(overrides: list[str], task: type[Task]) -> list[str]:
     name = task_name(task)
     register_task(name, task)
     return overrides if "resume=true" in overrides else [f"env={name}", *overrides]
-
-
-def _as_saved(config: Config, overrides: list[str]) -> Config:
-    """The saved configuration with the given settings, if a run is resumed without naming its task or algorithm.
-
-    Raises:
-        UserError: the saved run has a reward function that neither the overrides name nor the user has named before,
-            or logs to Weights & Biases, and the overrides do not say so. A folder must not run code or upload.
-    """
-    if config.env.reward_function:
-        only_known(source_path(config.env.reward_function), None)
-    given = {present_key(override.partition("=")[0]) for override in overrides}
-    if not (config.resume and config.run_dir) or given & {"env", "algo", "recipe"}:
-        return config
-    saved = read_saved_config(run_folder.open_existing(config.run_dir))
-    source = saved.env.reward_function
-    if source and "env.reward_function" not in given:
-        require_trusted(source)
-    project = saved.wandb_project
-    if project and "wandb_project" not in given:
-        named = shlex.quote(f"wandb_project={project}")
-        raise UserError(f"the saved run logs to Weights & Biases; to go on, add {named}, or wandb_project=null")
-    for key in given - {"hardware"} | {"run_dir", "resume"}:
-        saved = with_setting(saved, key, operator.attrgetter(key)(config))
-    return saved

@@ -50,7 +50,8 @@ class SavedPolicy:
         Raises:
             UserError: no usable policy.
         """
-        self.path = folder.path
+        self.path = folder.path.absolute()
+        """The folder, whatever becomes of the working directory."""
         saved = read_saved_config(folder)
         self.reward_function = saved.env.reward_function
         """`PATH.py:FUNCTION` of the training, which is not loaded."""
