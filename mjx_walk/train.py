@@ -23,11 +23,12 @@ from mjx_walk.runs.config import (
     Config,
     compose_config,
     load_config,
-    register_schemas,
     to_config,
     with_absolute_paths,
 )
 from mjx_walk.runs.overrides import complete_overrides, key_of_value
+from mjx_walk.runs.own_hydra import own_hydra
+from mjx_walk.runs.recipe_files import with_stored_recipes
 from mjx_walk.runs.renamed import present_overrides
 from mjx_walk.training import launcher
 from mjx_walk.training.distributed import Processes, join_processes
@@ -48,7 +49,7 @@ usage: python -m mjx_walk.train [env=humanoid] [algo=ppo] [KEY=VALUE ...]
   physics=auto|warp|jax|c   num_envs=N   total_steps=N   seed=N   run_dir=PATH   resume=true
   seeds=N or [3,7]                        train several seeds in one program, each with its own folder
   devices=all or N                        train one run on N GPUs, with one process and num_envs environments each
-  recipe=PATH_BELOW_configs/recipe        use a recipe other than the default for the environment and the hardware
+  recipe=NAME or FILE.yaml                use another recipe of configs/recipe, or a file of your own
   env.task=FILE.py:CLASS                  train on a task of your own, see docs/your_own.md
   env.KEY=VALUE                           set one of Gymnasium's keywords, or env.version=v4
   algo.KEY=VALUE                          set an algorithm's setting
@@ -178,11 +179,11 @@ def _through_hydra(arguments: list[str]) -> None:
     check([str(o.input_line) for o in plain])
     if {"-m", "--multirun"} & {*flags} and {"-c", "--cfg", "-i", "--info"} & {*flags}:
         raise UserError("-m trains a sweep and --cfg prints a configuration: give one of them")
-    sys.argv = [sys.argv[0], *flags, *overrides]  # Hydra wants all overrides together
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    register_schemas()
     try:
-        hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")(_sweep_job)()
+        with own_hydra() as store:
+            sys.argv = [sys.argv[0], *flags, *with_stored_recipes(overrides, store)]  # Hydra wants overrides together
+            hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")(_sweep_job)()
     except HydraException as error:
         what, _, _ = str(error).partition("Config search path")
         raise UserError(" ".join(what.split())) from error
