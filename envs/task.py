@@ -71,7 +71,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         check_version(options, self.XML_FILES, self.MISSING_VERSIONS, {"v5": self.V5_ONLY, "v4": self.V4_ONLY})
         self.options = options = with_absolute_paths(options, Path.cwd())
         self.max_episode_steps = options.max_episode_steps
-        self.model = models.load_model(options.xml_file or self.XML_FILES[options.version])
+        self.model_file = options.xml_file or self.XML_FILES[options.version]
+        self.model = models.load_model(self.model_file)
         self.body_ids = {body: models.body_id(self.model, body) for body in self.named_bodies()}
         models.check_model(self.model, options.name, self.MODEL_NEEDS)
         if options.xml_file:

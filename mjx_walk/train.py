@@ -26,10 +26,12 @@ from mjx_walk.runs.config import (
     to_config,
     with_absolute_paths,
 )
+from mjx_walk.runs.inputs import check_inputs
 from mjx_walk.runs.overrides import complete_overrides, key_of_value
 from mjx_walk.runs.own_hydra import own_hydra
 from mjx_walk.runs.recipe_files import with_stored_recipes
 from mjx_walk.runs.renamed import present_overrides
+from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.training import launcher
 from mjx_walk.training.distributed import Processes, join_processes
 from mjx_walk.utils import cli
@@ -199,7 +201,9 @@ def _sweep_job(node: DictConfig) -> None:
     with open_dict(node):
         node.run_dir = os.path.join(runtime.cwd, user_path(node.run_dir or runtime.output_dir))
     config = with_absolute_paths(to_config(node), Path(runtime.cwd))
-    if not config.resume:
+    if config.resume:
+        check_inputs(RunFolder(Path(node.run_dir)), config.env, config.env)
+    else:
         refuse_ineffective(config, (o.partition("=")[0] for o in HydraConfig.get().overrides.task))
     _, signal_name = train([config])
     if signal_name:

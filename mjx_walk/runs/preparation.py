@@ -109,6 +109,8 @@ def _check(folder: RunFolder, config: Config) -> None:
         moved.append("env.reward_function ")
     if not (saved.env.task and config.env.task) or name_same_file(saved.env.task, config.env.task):
         moved.append("env.task ")
+    if name_same_file(saved.env.xml_file, config.env.xml_file):
+        moved.append("env.xml_file ")
     differing = [text for text in differing if not text.startswith(tuple(moved))]
     if differing:
         raise UserError(

@@ -5,18 +5,21 @@ import os
 from pathlib import Path
 
 import gymnasium
+import imageio.v3 as iio
+import numpy as np
 import pytest
 from gymnasium.envs.mujoco.mujoco_env import expand_model_path
 
 from mjx_walk.envs import TASKS, make_env
+from mjx_walk.envs.model_files import source_hashes
+from mjx_walk.envs.models import load_model
 from mjx_walk.runs.config import load_config
+from mjx_walk.utils.errors import UserError
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 
-@pytest.mark.parametrize(
-    "given", ["hopper.xml", "./hopper.xml", "sub/hopper.xml", "../work/hopper.xml", "~/hopper.xml"]
-)
+@pytest.mark.parametrize("given", ["hopper.xml", "./hopper.xml", "a/hopper.xml", "../work/hopper.xml", "~/hopper.xml"])
 def test_a_name_is_looked_up_as_gymnasium_does(given, tmp_path, monkeypatch):
     """An asset's name is the asset, whatever the working directory holds; a path is never one."""
     for folder in ("work/a", "home"):
@@ -65,3 +68,63 @@ def test_a_task_keeps_its_files_when_the_working_directory_changes(tmp_path, mon
     monkeypatch.chdir("/")
     assert copy.deepcopy(task).gymnasium_kwargs() == {"xml_file": str(tmp_path / "mine.xml")}
     assert env.reset(seed=0)[0].shape == (11,)
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """A model of several files: nested includes, assets in the compiler's folders, and a submodel with its own."""
+    tetrahedron = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    texts = {
+        "robot.xml": (
+            '<mujoco><!-- <include file="unused.xml"/> --><compiler meshdir="./meshes" texturedir="pictures"/>'
+            '<include file="parts/body.xml"/><asset><model name="arm" file="arm/arm.xml"/></asset></mujoco>'
+        ),
+        "parts/body.xml": (
+            '<mujoco><include file="assets.xml"/><worldbody><body><joint/><geom type="mesh" mesh="torso"/></body>'
+            '<frame><attach model="arm" body="upper" prefix="arm_"/></frame></worldbody></mujoco>'
+        ),
+        "parts/assets.xml": (
+            "<mujoco><asset><mesh name='torso' file='torso.obj'/><texture name='skin' type='2d' file='skin.png'/>"
+            '<hfield name="ground" file="ground.png" size="1 1 1 1"/></asset></mujoco>'
+        ),
+        "meshes/torso.obj": tetrahedron,
+        "arm/arm.xml": (
+            '<mujoco><compiler assetdir="."/><asset><mesh name="hand" file="hand.obj"/></asset><worldbody>'
+            '<body name="upper"><joint/><geom type="mesh" mesh="hand"/></body></worldbody></mujoco>'
+        ),
+        "arm/hand.obj": tetrahedron,
+        "unused.xml": "<mujoco/>",
+        "torso.obj": "not read",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    picture = np.zeros((4, 4, 3), np.uint8)
+    for name in ("pictures/skin.png", "meshes/ground.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        iio.imwrite(tmp_path / name, picture)
+    return tmp_path
+
+
+def test_every_file_that_mujoco_reads_is_a_source(robot):
+    """A file is a source exactly if MuJoCo cannot read the model without it."""
+    model = str(robot / "robot.xml")
+    load_model(model)
+    found = source_hashes(model)
+    needed = set()
+    for path in [path for path in robot.rglob("*") if path.is_file()]:
+        content = path.read_bytes()
+        path.unlink()
+        try:
+            load_model(model)
+        except UserError:
+            needed.add(str(path.relative_to(robot)))
+        path.write_bytes(content)
+    assert found.keys() == needed and len(needed) == 8
+    for name in needed:
+        content = (robot / name).read_bytes()
+        (robot / name).write_bytes(content + b" ")
+        assert {key for key, value in source_hashes(model).items() if found[key] != value} == {name}
+        (robot / name).write_bytes(content)
+    assert source_hashes(model) == found
+    assert source_hashes("ant.xml").keys() == {"ant.xml"}
