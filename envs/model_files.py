@@ -21,6 +21,8 @@ _ATTRIBUTE = re.compile(r"""([\w:.-]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
 _TAG = re.compile(r"""<([\w:.-]+)((?:[^<>"']|"[^"]*"|'[^']*')*)>""")
 _FILE = re.compile("file(name|right|left|up|down|front|back)?")
 """Attributes that name a file."""
+_FOLDERS = {"mesh": "meshdir", "flexcomp": "meshdir", "texture": "texturedir"}
+"""The compiler's attribute for the folder of an element's file; `assetdir` for other elements."""
 
 
 def model_path(xml_file: str) -> Path:
@@ -87,22 +89,20 @@ def _find_sources(root: Path, name: str, found: dict[str, None]) -> None:
         compiler |= attributes if tag == "compiler" else {}
     is_stripped = compiler.get("strippath") == "true" or any(tag == "robot" for _, tag, _ in tags)
     for place, tag, attributes in tags:
-        named = (
-            []
-            if tag in ("include", "compiler")
-            else [value for key, value in attributes.items() if _FILE.fullmatch(key)]
-        )
-        keys = ("texturedir" if tag == "texture" else "meshdir", "assetdir")
-        folders = [os.path.join(folder, compiler[key]) for key in keys if key in compiler]
-        for value in named:
+        if tag in ("include", "compiler"):
+            continue
+        shared = compiler.get("assetdir", "")
+        searched = os.path.join(folder, compiler.get(_FOLDERS.get(tag, ""), shared))
+        opened = os.path.join(folder, compiler.get("texturedir" if tag == "texture" else "meshdir", shared))
+        for value in (value for key, value in attributes.items() if _FILE.fullmatch(key)):
             if tag == "model":
                 submodel = _first_file(root, (folder, place), value)
                 if submodel:
                     _find_sources(root, submodel, found)
                 continue
             asset = os.path.basename(value) if is_stripped else value.removeprefix("package://")
-            places = (os.path.join(above, place) for above in folders)  # beside an included file
-            source = _first_file(root, (*folders, folder, *places, place), asset)
+            is_beside = place != folder and not (root / searched / asset).is_file()  # beside an included file
+            source = _first_file(root, ([place] if is_beside else []) + [opened, searched, folder], asset)
             found |= {source: None} if source else {}
 
 

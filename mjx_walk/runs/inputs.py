@@ -153,4 +153,5 @@ def _read(folder: RunFolder) -> Inputs:
 def _are_inputs(content: Any) -> bool:
     if not isinstance(content, dict) or not all(isinstance(hashes, dict) for hashes in content.values()):
         return False
-    return all(isinstance(found, str) for hashes in content.values() for found in hashes.values())
+    hashes = {name: found for hashes in content.values() for name, found in hashes.items()}
+    return all(name.isprintable() and isinstance(found, str) for name, found in hashes.items())

@@ -100,7 +100,7 @@ def robot(tmp_path):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
     picture = np.zeros((4, 4, 3), np.uint8)
-    for name in ("pictures/skin.png", "meshes/ground.png"):
+    for name in ("pictures/skin.png", "parts/ground.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         iio.imwrite(tmp_path / name, picture)
     return tmp_path
