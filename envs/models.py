@@ -1,24 +1,21 @@
-"""MuJoCo models: where `xml_file` finds one, loading it, and looking up its parts."""
+"""MuJoCo models: loading one, and looking up its parts."""
 
 import logging
+import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-import gymnasium
 import mujoco
 import numpy as np
 
+from mjx_walk.envs.model_files import ASSETS, model_path
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import user_path
 from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.quiet_mujoco import hide_deprecations, write_no_log
 
 _LOGGER = logging.getLogger(__name__)
-
-_ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
-"""Gymnasium's models."""
 
 
 class ModelNeeds(NamedTuple):
@@ -33,14 +30,6 @@ class ModelNeeds(NamedTuple):
     """Whether a model with more positions or velocities is refused, too."""
 
 
-def model_path(xml_file: str) -> Path:
-    """Path of a model. A bare name is one of Gymnasium's assets, even if the working directory has such a file."""
-    path = user_path(xml_file)
-    if len(path.parts) == 1:
-        return _ASSETS / xml_file
-    return path
-
-
 def load_model(xml_file: str) -> mujoco.MjModel:
     """Load a MuJoCo model.
 
@@ -51,9 +40,9 @@ def load_model(xml_file: str) -> mujoco.MjModel:
         UserError: the file does not exist, or MuJoCo cannot read it.
     """
     write_no_log()
-    path = model_path(xml_file)
+    path = Path(os.path.abspath(model_path(xml_file)))
     if not path.is_file():
-        raise UserError(_not_found(str(xml_file), path))
+        raise UserError(_not_found(xml_file, path))
     if "\\" in str(path):
         raise UserError(f"MuJoCo cannot open {path}: it takes the backslash for a separator; choose another path")
     try:
@@ -65,11 +54,11 @@ def load_model(xml_file: str) -> mujoco.MjModel:
 
 def _not_found(xml_file: str, path: Path) -> str:
     """The error for a model file that does not exist."""
-    if path.is_dir() or user_path(xml_file).is_dir():
+    if path.is_dir():
         return f"model file not found: {xml_file} is a folder; write the path of an XML file"
-    if path.parent != _ASSETS:
+    if len(Path(xml_file).parts) > 1:
         return f"model file not found: {path}"
-    near = near_misses(xml_file, sorted(asset.name for asset in _ASSETS.glob("*.xml")))
+    near = near_misses(xml_file, sorted(asset.name for asset in ASSETS.glob("*.xml")))
     hint = f"; did you mean: {', '.join(near)}?" if near else ""
     return f"model file not found: {xml_file} is neither in this folder nor one of Gymnasium's models{hint}"
 

@@ -1,6 +1,7 @@
 """What all Gymnasium tasks share: model, engine, resets, finiteness check, time limit."""
 
 import abc
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,7 +18,7 @@ from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_en
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping, shaping_terms, term_names
 from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape, check_state_shape, is_finite
-from mjx_walk.envs.task_options import TaskOptions, check_version
+from mjx_walk.envs.task_options import TaskOptions, check_version, with_absolute_paths
 from mjx_walk.envs.user_files import load_reward_function
 from mjx_walk.envs.view import View
 from mjx_walk.utils.compat import standard_dtypes
@@ -69,9 +70,10 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
                 reads or has what the engine does not simulate.
         """
         check_version(options, self.XML_FILES, self.MISSING_VERSIONS, {"v5": self.V5_ONLY, "v4": self.V4_ONLY})
-        self.options = options
+        self.options = options = with_absolute_paths(options, Path.cwd())
         self.max_episode_steps = options.max_episode_steps
-        self.model = models.load_model(options.xml_file or self.XML_FILES[options.version])
+        self.model_file = options.xml_file or self.XML_FILES[options.version]
+        self.model = models.load_model(self.model_file)
         self.body_ids = {body: models.body_id(self.model, body) for body in self.named_bodies()}
         models.check_model(self.model, options.name, self.MODEL_NEEDS)
         if options.xml_file:

@@ -1,16 +1,16 @@
 """Env options that all tasks share."""
 
 import dataclasses
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mjx_walk.envs.models import model_path
+from mjx_walk.envs.model_files import absolute_xml_file, model_path
 from mjx_walk.envs.reward_shaping import Shaping
 from mjx_walk.envs.state import NO_TIME_LIMIT
 from mjx_walk.envs.user_files import absolute_source
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import user_path
 from mjx_walk.utils.settings import setting
 
 MAX_FRAME_SKIP = 10_000
@@ -25,7 +25,8 @@ class TaskOptions:
     version: str = setting("v5", choices=("v5", "v4"))
     """Version of Gymnasium's environment."""
     xml_file: str | None = None
-    """Model file: a path, or the name of one of Gymnasium's assets. Default: the version's own model."""
+    """Model file: the name of one of Gymnasium's assets, or a path. The file of that name in the working directory is
+    `./NAME`. Default: the version's own model."""
     frame_skip: int = setting(5, at_least=1, at_most=MAX_FRAME_SKIP)
     """Physics steps of one environment step."""
     max_episode_steps: int = setting(1000, at_least=1, at_most=NO_TIME_LIMIT)
@@ -57,7 +58,7 @@ class TaskOptions:
         """Keyword arguments of Gymnasium's class for the equivalent environment, without those at their default."""
         keywords = {name: value for name, value in self.changed().items() if name not in _NOT_IN_GYMNASIUM}
         if self.xml_file:  # Gymnasium finds relative paths elsewhere
-            keywords["xml_file"] = str(model_path(self.xml_file).absolute())
+            keywords["xml_file"] = os.path.abspath(model_path(self.xml_file))
         return keywords
 
 
@@ -97,8 +98,7 @@ def with_absolute_paths(options: TaskOptions, folder: Path) -> TaskOptions:
         folder: what a relative path is relative to.
     """
     xml_file, source = options.xml_file, options.reward_function
-    if xml_file and (folder / user_path(xml_file)).is_file():
-        xml_file = str((folder / user_path(xml_file)).resolve())
+    xml_file = absolute_xml_file(xml_file, folder) if xml_file else None
     source = absolute_source(source, folder) if source else source
     task = absolute_source(options.task, folder) if options.task else None
     return dataclasses.replace(options, xml_file=xml_file, reward_function=source, task=task)

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import functools
 import logging
-import operator
 import shlex
 import typing
 from collections.abc import Callable
@@ -17,7 +16,6 @@ from mjx_walk.algos import make_algorithm
 from mjx_walk.envs import BUILT_IN_TASKS, Task, register_task
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.envs.registry import task_name
-from mjx_walk.envs.user_files import only_known, source_path
 from mjx_walk.evaluation.gymnasium_scores import (
     Episodes,
     ScoreRequest,
@@ -25,7 +23,6 @@ from mjx_walk.evaluation.gymnasium_scores import (
     score_in_gymnasium,
     score_in_sim,
 )
-from mjx_walk.runs import run_folder
 from mjx_walk.runs.config import Config, load_config
 from mjx_walk.runs.loggers import require_wandb
 from mjx_walk.runs.metrics import Row, read_rows
@@ -33,12 +30,11 @@ from mjx_walk.runs.overrides import key_of_value
 from mjx_walk.runs.own_tasks import KEY
 from mjx_walk.runs.policies import SavedPolicy, deterministic_policy, make_task
 from mjx_walk.runs.preparation import prepared
-from mjx_walk.runs.renamed import present_key
+from mjx_walk.runs.resuming import as_saved
 from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.saved_config import read_saved_config, with_setting
 from mjx_walk.runs.saved_yaml import read_yaml
 from mjx_walk.runs.scores import BEST, Scores
-from mjx_walk.runs.trust import remember, require_trusted
+from mjx_walk.runs.trust import remember
 from mjx_walk.training.announcement import announce
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.memory_check import check_replay
@@ -60,8 +56,15 @@ class Run(SavedPolicy):
 
     @functools.cached_property
     def metrics(self) -> list[Row]:
-        """All rows of `metrics.jsonl`."""
-        return read_rows(self.path / "metrics.jsonl")
+        """All rows of `metrics.jsonl`; none for a policy of the zoo, which has no such file.
+
+        Raises:
+            UserError: the file is gone, or cannot be read.
+        """
+        path = RunFolder(self.path).metrics
+        if not path.exists() and not zoo.holds(self.path):
+            raise UserError(f"{path} is missing; restore it, or load the run from the folder that has it")
+        return read_rows(path)
 
     @standard_settings()
     def evaluate(self, episodes: int = 100, backend: str = "gymnasium", seed: int = 0) -> Scores:
@@ -130,7 +133,7 @@ def resolve(overrides: list[str]) -> Config:
     Raises:
         UserError: invalid overrides.
     """
-    return _as_saved(load_config(overrides), overrides)
+    return as_saved(load_config(overrides), overrides)
 
 
 def resolve_seeds(overrides: list[str], seeds: list[int]) -> list[Config]:
@@ -147,11 +150,14 @@ def resolve_seeds(overrides: list[str], seeds: list[int]) -> list[Config]:
     with_seeds = [dataclasses.replace(config, seed=seed) for seed in seeds]
     for one in with_seeds:
         one.run_dir = str(Path(one.run_dir, f"seed_{one.seed}")) if one.run_dir is not None else None
-    return [_as_saved(one, overrides) for one in with_seeds]
+    return [as_saved(one, overrides) for one in with_seeds]
 
 
 def train(
-    configs: list[Config], on_metrics: Callable[[Row], None] | None = None, processes: Processes | None = None
+    configs: list[Config],
+    on_metrics: Callable[[Row], None] | None = None,
+    processes: Processes | None = None,
+    runs: Path = Path("runs"),
 ) -> tuple[list[RunFolder], str | None]:
     """Train one run, or several that differ only in their seed, and score them in the real Gymnasium.
 
@@ -161,6 +167,7 @@ def train(
         configs: checked configurations, equal except for `seed` and `run_dir`.
         on_metrics: called with every logged row.
         processes: the processes that train one run together, including this one.
+        runs: the folder for the folders of runs without `run_dir`.
 
     Returns:
         The run folders, and the name of the signal that stopped training early, if one did.
@@ -181,7 +188,7 @@ def train(
         closing.callback(task.engine.preparation.cancel)
         if task.reward_hashes and processes.is_main_process:
             remember(configs[0].env.reward_function, task.reward_hashes)
-        folders, configs = _prepare(configs, task, processes, closing)
+        folders, configs = _prepare(configs, task, processes, closing, runs)
         trainer = Trainer(configs, task, folders, on_metrics, processes)
         with as_by_ctrl_c(), contextlib.closing(trainer):
             signal_name = trainer.train()
@@ -193,7 +200,7 @@ def train(
 
 
 def _prepare(
-    configs: list[Config], task: Task, processes: Processes, closing: contextlib.ExitStack
+    configs: list[Config], task: Task, processes: Processes, closing: contextlib.ExitStack, runs: Path
 ) -> tuple[list[RunFolder], list[Config]]:
     """Check that the runs fit this machine, and prepare their folders. All processes get the main one's folder.
 
@@ -203,7 +210,7 @@ def _prepare(
     replay = check_replay(algorithm, Path(configs[0].run_dir or "."), len(configs))
     folders: list[RunFolder] = []
     if processes.is_main_process:
-        folders, configs = closing.enter_context(prepared(configs))
+        folders, configs = closing.enter_context(prepared(configs, runs))
         announce(configs[0], folders, processes.process_count)
         if replay:
             _LOGGER.info(replay)
@@ -258,8 +265,13 @@ def run(
     refuse_flags(overrides, key_of_value, typing.get_type_hints(Config))
     if task is not None:
         overrides = _with_task(overrides, task)
-    folders, _ = train([resolve(overrides)], on_metrics)
+    folders, _ = train([_in_absolute_folder(resolve(overrides))], on_metrics, runs=Path("runs").absolute())
     return load_run(folders[0].path)
+
+
+def _in_absolute_folder(config: Config) -> Config:
+    """A configuration whose run folder stays the same one if the program changes its working directory."""
+    return dataclasses.replace(config, run_dir=config.run_dir and str(Path(config.run_dir).absolute()))
 
 
 def _with_task(overrides: list[str], task: type[Task]) -> list[str]:
@@ -272,28 +284,3 @@ def _with_task(overrides: list[str], task: type[Task]) -> list[str]:
     name = task_name(task)
     register_task(name, task)
     return overrides if "resume=true" in overrides else [f"env={name}", *overrides]
-
-
-def _as_saved(config: Config, overrides: list[str]) -> Config:
-    """The saved configuration with the given settings, if a run is resumed without naming its task or algorithm.
-
-    Raises:
-        UserError: the saved run has a reward function that neither the overrides name nor the user has named before,
-            or logs to Weights & Biases, and the overrides do not say so. A folder must not run code or upload.
-    """
-    if config.env.reward_function:
-        only_known(source_path(config.env.reward_function), None)
-    given = {present_key(override.partition("=")[0]) for override in overrides}
-    if not (config.resume and config.run_dir) or given & {"env", "algo", "recipe"}:
-        return config
-    saved = read_saved_config(run_folder.open_existing(config.run_dir))
-    source = saved.env.reward_function
-    if source and "env.reward_function" not in given:
-        require_trusted(source)
-    project = saved.wandb_project
-    if project and "wandb_project" not in given:
-        named = shlex.quote(f"wandb_project={project}")
-        raise UserError(f"the saved run logs to Weights & Biases; to go on, add {named}, or wandb_project=null")
-    for key in given - {"hardware"} | {"run_dir", "resume"}:
-        saved = with_setting(saved, key, operator.attrgetter(key)(config))
-    return saved

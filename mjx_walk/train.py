@@ -25,13 +25,15 @@ from mjx_walk.runs.config import (
     Config,
     compose_config,
     load_config,
-    register_schemas,
     to_config,
     with_absolute_paths,
 )
+from mjx_walk.runs.inputs import check_inputs
 from mjx_walk.runs.overrides import complete_overrides, key_of_value
+from mjx_walk.runs.own_hydra import own_hydra
+from mjx_walk.runs.recipe_files import with_stored_recipes
 from mjx_walk.runs.renamed import present_overrides
-from mjx_walk.runs.run_folder import new_folder
+from mjx_walk.runs.run_folder import RunFolder, new_folder
 from mjx_walk.training import launcher
 from mjx_walk.training.distributed import Processes, join_processes
 from mjx_walk.utils import cli
@@ -51,7 +53,7 @@ usage: python -m mjx_walk.train [env=humanoid] [algo=ppo] [KEY=VALUE ...]
   physics=auto|warp|jax|c   num_envs=N   total_steps=N   seed=N   run_dir=PATH   resume=true
   seeds=N or [3,7]                        train several seeds in one program, each with its own folder
   devices=all or N                        train one run on N GPUs, with one process and num_envs environments each
-  recipe=PATH_BELOW_configs/recipe        use a recipe other than the default for the environment and the hardware
+  recipe=NAME or FILE.yaml                use another recipe of configs/recipe, or a file of your own
   env.task=FILE.py:CLASS                  train on a task of your own, see docs/your_own.md
   env.KEY=VALUE                           set one of Gymnasium's keywords, or env.version=v4
   algo.KEY=VALUE                          set an algorithm's setting
@@ -182,9 +184,9 @@ def _through_hydra(arguments: list[str]) -> None:
     if {"-m", "--multirun"} & {*flags} and {"-c", "--cfg", "-i", "--info"} & {*flags}:
         raise UserError("-m trains a sweep and --cfg prints a configuration: give one of them")
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    register_schemas()
-    with _sweep_folder(flags, [override.key_or_group for override in parsed]) as folder:
-        sys.argv = [sys.argv[0], *flags, *overrides, *folder]  # Hydra wants all overrides together
+    with _sweep_folder(flags, [override.key_or_group for override in parsed]) as folder, own_hydra() as store:
+        # Hydra wants all overrides together.
+        sys.argv = [sys.argv[0], *flags, *with_stored_recipes(overrides, store), *folder]
         try:
             hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")(_sweep_job)()
         except HydraException as error:
@@ -220,7 +222,9 @@ def _sweep_job(node: DictConfig) -> None:
     with open_dict(node):
         node.run_dir = os.path.join(runtime.cwd, user_path(node.run_dir or runtime.output_dir))
     config = with_absolute_paths(to_config(node), Path(runtime.cwd))
-    if not config.resume:
+    if config.resume:
+        check_inputs(RunFolder(Path(node.run_dir)), config.env, config.env)
+    else:
         refuse_ineffective(config, (o.partition("=")[0] for o in HydraConfig.get().overrides.task))
     _, signal_name = train([config])
     if signal_name:

@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import shutil
 from pathlib import Path
 
 import gymnasium
@@ -16,6 +18,7 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import make_env
 from mjx_walk.training import trainer
 from mjx_walk.utils import settings
+from mjx_walk.utils.errors import UserError
 
 
 @pytest.fixture(scope="module")
@@ -208,3 +211,24 @@ def test_help_says_what_the_settings_of_an_algorithm_mean(algo, capsys):
 def test_flags_may_stand_anywhere(arguments, capsys):
     assert command_here("train", *arguments) == 0
     assert "name: walker2d" in capsys.readouterr().out
+
+
+def test_a_run_keeps_its_folder_when_the_working_directory_changes(finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(finished[0].path, "copy")
+    run = mjx_walk.load_run("copy")
+    monkeypatch.chdir("/")
+    assert run.path == tmp_path / "copy" and run.metrics == finished[0].metrics
+    (tmp_path / "copy" / "metrics.jsonl").unlink()
+    with pytest.raises(UserError, match=f"{tmp_path}/copy/metrics.jsonl is missing"):
+        _ = mjx_walk.load_run(tmp_path / "copy").metrics
+    assert mjx_walk.load_run("zoo:hopper-ppo").metrics == []
+
+
+def test_a_training_keeps_its_folder_when_a_callback_changes_the_working_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    arguments = [*TINY, "run_dir=run", f"total_steps={2 * TINY_CALL}"]
+    run = mjx_walk.run(arguments, on_metrics=lambda row: os.chdir(tmp_path / "elsewhere"))
+    assert run.path == tmp_path / "run" and len(run.metrics) == 2
+    assert not list((tmp_path / "elsewhere").iterdir())

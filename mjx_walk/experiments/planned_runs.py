@@ -18,6 +18,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config, load_config
+from mjx_walk.runs.inputs import changed_input
 from mjx_walk.runs.metrics import read_rows
 from mjx_walk.runs.overrides import complete_overrides, sweep_choices
 from mjx_walk.runs.preparation import locked_folder
@@ -153,6 +154,9 @@ def _check_same_configuration(run: PlannedRun) -> None:
         raise UserError(
             f"{run.folder.path} holds a run with other settings ({in_short(differing)}); choose another out=DIR"
         )
+    changed = changed_input(run.folder, run.config.env)
+    if changed:
+        raise UserError(f"{changed} has changed since {run.folder.path} was trained; choose another out=DIR")
 
 
 def jobs(runs: list[PlannedRun], together: int) -> list[list[PlannedRun]]:

@@ -5,17 +5,15 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mjx_walk import envs
-from mjx_walk.algos import ALGORITHMS
-from mjx_walk.envs import TASKS
 from mjx_walk.runs.mistakes import explain
 from mjx_walk.runs.overrides import complete_overrides
+from mjx_walk.runs.own_hydra import own_hydra
+from mjx_walk.runs.recipe_files import with_paths, with_stored_recipes
 from mjx_walk.runs.recipes import CONFIG_DIR, recipe_names
 from mjx_walk.runs.renamed import present_overrides
 from mjx_walk.runs.schema import CheckpointConfig, Config
@@ -31,25 +29,10 @@ __all__ = [
     "flatten",
     "load_config",
     "recipe_names",
-    "register_schemas",
     "to_config",
     "training_command",
     "with_absolute_paths",
 ]
-
-
-_registered: dict[tuple[str | None, str], type] = {}
-
-
-def register_schemas() -> None:
-    """Register the schema and the groups `env` and `algo` with Hydra."""
-    nodes: dict[tuple[str | None, str], type] = {(None, "schema"): Config}
-    nodes |= {("env", name): options for name, (_, options) in TASKS.items()}
-    nodes |= {("algo", name): settings for name, (_, settings) in ALGORITHMS.items()}
-    for (group, name), node in nodes.items():
-        if _registered.get((group, name)) is not node:  # Hydra takes a millisecond for each
-            ConfigStore.instance().store(group=group, name=name, node=node)
-            _registered[group, name] = node
 
 
 def load_config(overrides: list[str]) -> Config:
@@ -79,14 +62,12 @@ def compose_config(overrides: list[str]) -> Config:
         UserError: invalid overrides.
     """
     overrides = complete_overrides(overrides)
-    register_schemas()
-    GlobalHydra.instance().clear()
     try:
-        with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
-            node = compose("train", overrides)
-        return with_absolute_paths(to_config(node), Path.cwd())
+        with own_hydra() as store, initialize_config_dir(CONFIG_DIR, version_base="1.3"):
+            config = to_config(compose("train", with_stored_recipes(overrides, store)))
+        return with_absolute_paths(config, Path.cwd())
     except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(explain(error, overrides)) from error
+        raise UserError(with_paths(explain(error, overrides))) from error
 
 
 def to_config(node: Any) -> Config:

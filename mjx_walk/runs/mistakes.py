@@ -3,10 +3,12 @@
 import difflib
 import re
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
+from mjx_walk.runs.recipe_files import recipe_file, recipe_settings
 from mjx_walk.runs.recipes import fitting_recipes, recipe_names
 from mjx_walk.runs.schema import chosen, setting_types
 from mjx_walk.utils.errors import first_line
@@ -133,11 +135,31 @@ def _unfit_recipe(text: str, given: dict[str, str], env: str, algo: str) -> str:
     """The error for a recipe that sets what the algorithm or the task lacks: the first line names its file."""
     file = re.search(r"recipe/([\w/-]+)", text)
     recipe = given.get("recipe") or (file[1] if file else "")
+    own = recipe_file(recipe.strip("'")) if recipe else None
+    if own:
+        return _mistake_in_file(own, text, env, algo)
     meant_env, _, meant_algo = recipe.rpartition("/")[2].rpartition("_")
     meant = [f"env={meant_env}"] if meant_env in TASKS and meant_env != env else []
     meant += [f"algo={meant_algo}"] if meant_algo in ALGORITHMS and meant_algo != algo else []
     hint = f"add {' '.join(meant)}" if meant else fitting_recipes(env, algo)
     return f"recipe={recipe} does not fit env={env} algo={algo}; {hint}"
+
+
+def _mistake_in_file(recipe: Path, text: str, env: str, algo: str) -> str:
+    """The error for a recipe file of the user: an unknown key, or a value of another type."""
+    settings = list(recipe_settings(recipe))
+    choices = {"/env": env, "/algo": algo} | {key: value for _, key, value in settings if key.startswith("/")}
+    env, algo = choices["/env"], choices["/algo"]
+    types = setting_types(env, algo)
+    for file, key, value in settings:
+        if key in ("env", "algo", "hardware"):
+            return f"{file} sets {key}: {value}; write '- override /{key}: {value}' below 'defaults:'"
+        if key not in types and not key.startswith("/"):
+            return f"{file}: {unknown_key(key, env, algo)}"
+    for file, key, value in settings:
+        if f"full_key: {key}\n" in f"{text}\n":
+            return f"{file}: {type_mistake(key, str(value), types[key]) or f'{key}: {value} is not valid'}"
+    return f"{recipe} does not fit env={env} algo={algo}: {text.splitlines()[-1].strip()}"
 
 
 def _unknown_choice(group: str, value: str, env: str, algo: str) -> str:

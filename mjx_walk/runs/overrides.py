@@ -23,8 +23,8 @@ from mjx_walk.utils.value_types import plain_type, with_whole_number
 
 __all__ = ["complete_overrides", "key_of_value", "sweep_choices"]
 
-_TEXTS = frozenset({"run_dir", "wandb_project"})
-"""Settings that hold any text, besides those of tasks and algorithms."""
+_TEXTS = frozenset({"run_dir", "wandb_project", "recipe"})
+"""Keys that hold any text, besides settings of tasks and algorithms."""
 _HYDRA_FOLDERS = frozenset({"hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir"})
 """Hydra's own settings that hold a path. It does not sweep over them."""
 _PARTS = re.compile(r"""(?:^|,)\s*('(?:[^'\\]|\\.)*'\s*(?=,|$)|"(?:[^"\\]|\\.)*"\s*(?=,|$)|[^,]*)""")

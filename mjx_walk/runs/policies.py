@@ -17,6 +17,7 @@ from mjx_walk.envs.inline_evaluation import NO_RETURN
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.config import Config
+from mjx_walk.runs.inputs import check_model, warn_of_changed_inputs
 from mjx_walk.runs.run_folder import RunFolder
 from mjx_walk.runs.saved_config import read_saved_config
 from mjx_walk.runs.scores import BEST, FINAL, POLICIES
@@ -53,13 +54,16 @@ class SavedPolicy:
         Raises:
             UserError: no usable policy.
         """
-        self.path = folder.path
+        self.path = folder.path.absolute()
+        """The folder, whatever becomes of the working directory."""
         saved = read_saved_config(folder)
         self.reward_function = saved.env.reward_function
         """`PATH.py:FUNCTION` of the training, which is not loaded."""
         self.config = _without_reward_function(saved)
         self._physics = physics
+        check_model(folder, self.config.env)
         self._build()
+        warn_of_changed_inputs(folder, saved.env)
         self.policy_name = choose_policy(folder, policy)
         """`final` or `best`."""
         self.policy_params, self.policy_facts = _load(folder, self.policy_name, self.algorithm)

@@ -19,7 +19,7 @@ _CANNOT_WRITE = "cannot write to run_dir={}: {}"
 
 
 @contextlib.contextmanager
-def prepared(configs: list[Config]) -> Iterator[tuple[list[RunFolder], list[Config]]]:
+def prepared(configs: list[Config], runs: Path = Path("runs")) -> Iterator[tuple[list[RunFolder], list[Config]]]:
     """Create or check the folders of runs that train together, and lock them. Nothing is overwritten.
 
     All folders are checked before the first one is created, and again under their locks.
@@ -27,6 +27,7 @@ def prepared(configs: list[Config]) -> Iterator[tuple[list[RunFolder], list[Conf
     Args:
         configs: configurations of the runs, which may differ in `seed` and `run_dir`. Without `run_dir`, a new folder
             gets their runs.
+        runs: the folder for new folders.
 
     Yields:
         The folders, and the configurations with `run_dir` filled in.
@@ -39,7 +40,7 @@ def prepared(configs: list[Config]) -> Iterator[tuple[list[RunFolder], list[Conf
     if first.run_dir is None:
         if first.resume:
             raise UserError("resume=true needs run_dir=PATH of the run to continue")
-        new = new_folder(Path("runs", f"{first.env.name}_{first.algo.name}"))
+        new = new_folder(runs / f"{first.env.name}_{first.algo.name}")
         paths = [new if len(configs) == 1 else new / f"seed_{config.seed}" for config in configs]
         configs = [dataclasses.replace(config, run_dir=str(path)) for config, path in zip(configs, paths, strict=True)]
     folders = [RunFolder(Path(str(config.run_dir))) for config in configs]
@@ -112,6 +113,8 @@ def _check(folder: RunFolder, config: Config) -> None:
         moved.append("env.reward_function ")
     if not (saved.env.task and config.env.task) or name_same_file(saved.env.task, config.env.task):
         moved.append("env.task ")
+    if name_same_file(saved.env.xml_file, config.env.xml_file):
+        moved.append("env.xml_file ")
     differing = [text for text in differing if not text.startswith(tuple(moved))]
     if differing:
         raise UserError(

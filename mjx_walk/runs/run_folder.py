@@ -28,6 +28,11 @@ class RunFolder:
         return self.path / "config.yaml"
 
     @property
+    def inputs(self) -> Path:
+        """Record of the files that the run reads."""
+        return self.path / "inputs.json"
+
+    @property
     def metrics(self) -> Path:
         return self.path / "metrics.jsonl"
 
@@ -112,7 +117,7 @@ def open_existing(path: str | Path | None) -> RunFolder:
         _refuse_special_files(folder.path)
     if not folder.is_run:
         raise UserError(f"no run at '{path}': {_where_a_run_is(folder.path)}")
-    for path in (folder.config, folder.metrics, folder.gymnasium_scores):
+    for path in (folder.config, folder.inputs, folder.metrics, folder.gymnasium_scores):
         if path.is_dir():
             raise UserError(f"'{path}' is a folder, where a run has a file; remove it")
     for path in (folder.checkpoints, folder.policy(FINAL), folder.policy(BEST)):

@@ -164,4 +164,4 @@ def test_a_saved_asset_name_stays_gymnasiums_model(home):
     (home / "work" / "walker2d_v5.xml").write_text("not a model")
     assert make_task(read_config(home / "config.yaml")).action_size == 6
     with pytest.raises(UserError, match=f"MuJoCo cannot read {home}/work/walker2d_v5.xml"):
-        make_env("walker2d", physics="c", xml_file="walker2d_v5.xml")
+        make_env("walker2d", physics="c", xml_file="./walker2d_v5.xml")
