@@ -1,8 +1,10 @@
 """MuJoCo models: loading one, and looking up its parts."""
 
+import copy
 import logging
 import os
 import re
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +18,15 @@ from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.quiet_mujoco import hide_deprecations, write_no_log
 
 _LOGGER = logging.getLogger(__name__)
+
+
+_OWN_CHOICE = 4 * 2**20
+"""Memory that MuJoCo gives to the smallest model unless the file names another, bytes."""
+_TOO_LITTLE_MEMORY = 'memory="…" in <size> is too little for its contacts and limits; remove it, and MuJoCo chooses'
+_LOST = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
+"""MuJoCo's warnings that it has left out contacts or constraints."""
+_EVERYWHERE = 1e3
+"""Margin with which all contacts and limits act, m or rad."""
 
 
 class ModelNeeds(NamedTuple):
@@ -47,9 +58,33 @@ def load_model(xml_file: str) -> mujoco.MjModel:
         raise UserError(f"MuJoCo cannot open {path}: it takes the backslash for a separator; choose another path")
     try:
         with hide_deprecations():
-            return mujoco.MjModel.from_xml_path(str(path))
+            model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
+        if "(increase <size memory" in str(error):
+            raise UserError(f"{path}: {_TOO_LITTLE_MEMORY}") from error
         raise UserError(f"MuJoCo cannot read {path}: {_in_one_line(str(error))}") from error
+    if not _has_enough_memory(model):
+        raise UserError(f"{path}: {_TOO_LITTLE_MEMORY}")
+    return model
+
+
+def _has_enough_memory(model: mujoco.MjModel) -> bool:
+    """Whether the memory that a model file names suffices while every contact and every limit acts.
+
+    With less, MuJoCo leaves out constraints, or stops with an error in the middle of an episode.
+    """
+    if model.narena >= _OWN_CHOICE:
+        return True
+    worst = copy.deepcopy(model)
+    for margin in (worst.geom_margin, worst.pair_margin, worst.jnt_margin, worst.tendon_margin):
+        margin[:] = _EVERYWHERE
+    try:
+        data = mujoco.MjData(worst)
+        with warnings.catch_warnings(action="ignore"), hide_deprecations():
+            mujoco.mj_step(worst, data)
+    except (mujoco.FatalError, ValueError):
+        return False
+    return not data.warning.number[_LOST].any()
 
 
 def _not_found(xml_file: str, path: Path) -> str:

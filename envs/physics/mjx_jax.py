@@ -14,8 +14,9 @@ from mujoco.mjx._src import scan as mjx_scan
 from mujoco.mjx._src import smooth as mjx_smooth
 from mujoco.mjx._src import types as mjx_types
 
-from mjx_walk.envs.physics import capsule_frames_jax
+from mjx_walk.envs.physics import capsule_frames_jax, static_pairs
 from mjx_walk.envs.physics.base import Derived, PhysicsState
+from mjx_walk.envs.physics.jax_model import adapt_model
 from mjx_walk.envs.physics.mjx_model import check_derived, read_derived, with_newton_solver
 from mjx_walk.envs.physics.preparation import Preparation
 
@@ -31,7 +32,9 @@ class JaxEngine:
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
         capsule_frames_jax.install()
+        static_pairs.install()
         model = with_newton_solver(model)
+        adapt_model(model)
         self._model = self._own_model = mjx.put_model(model, impl="jax")
         self._blank = mjx.make_data(model, impl="jax")
         self._substep = _runge_kutta_4 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else _euler

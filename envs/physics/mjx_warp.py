@@ -18,6 +18,7 @@ from mjx_walk.envs.physics import capsule_frames_warp
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.mjx_model import check_derived, read_derived, with_newton_solver
 from mjx_walk.envs.physics.preparation import Preparation
+from mjx_walk.envs.physics.static_pairs import drop_static_pairs
 from mjx_walk.envs.physics.warp_kernels import choose_cache, load_kernels
 from mjx_walk.utils.devices import default_device
 
@@ -48,6 +49,7 @@ class WarpEngine:
         # On a CPU, this hides Warp's warning about a missing GPU.
         wp.config.log_level = wp.LOG_ERROR if jax.default_backend() == "cpu" else wp.LOG_WARNING
         self._mj_model = with_newton_solver(model)
+        drop_static_pairs(self._mj_model)
         # `step` returns overflows, so Warp need not print them.
         self._model = mjx.put_model(self._mj_model, impl="warp", device=default_device()).tree_replace(
             {"opt._impl.warn_overflow": 0}

@@ -6,13 +6,11 @@ on every engine. MJX silently ignores further features; those are refused on its
 """
 
 import logging
-from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import mujoco
-import numpy as np
-from jaxtyping import Shaped
 
+from mjx_walk.envs.physics import elements
 from mjx_walk.utils.errors import UserError, first_line
 
 __all__ = ["refuse_unsupported", "unsupported_by_mjx", "warn_of_approximations"]
@@ -28,8 +26,8 @@ class _Feature(NamedTuple):
 
     engines: tuple[str, ...]
     """The engines that do not simulate it."""
-    users: Callable[[mujoco.MjModel], Iterator[str]]
-    """The elements of a model that use it, as `kind 'name'`."""
+    users: elements.Users
+    """The elements of a model that use it."""
     what: str
     """The feature, as the subject of a sentence."""
     advice: str
@@ -66,151 +64,119 @@ def unsupported_by_mjx(engine: str, error: Exception) -> UserError:
     return UserError(f"physics={engine}: MJX does not support this model: {reason}; use physics=c")
 
 
-def _named(
-    kind: str, is_user: Callable[[mujoco.MjModel], Shaped[np.ndarray, " n"]]
-) -> Callable[[mujoco.MjModel], Iterator[str]]:
-    """The elements of one kind for which a condition on the model's arrays holds."""
-
-    def users(model: mujoco.MjModel) -> Iterator[str]:
-        for i in np.flatnonzero(is_user(model)):
-            name = getattr(model, kind)(int(i)).name
-            yield f"{_SPOKEN.get(kind, kind)} '{name}'" if name else f"{_SPOKEN.get(kind, kind)} {i}"
-
-    return users
-
-
-def _option(
-    text: str, is_used: Callable[[mujoco.MjOption], bool | int | float]
-) -> Callable[[mujoco.MjModel], Iterator[str]]:
-    """The `<option>` for which a condition holds."""
-
-    def users(model: mujoco.MjModel) -> Iterator[str]:
-        if is_used(model.opt):
-            yield text
-
-    return users
-
-
-def _any(*arrays: Shaped[np.ndarray, "n ..."]) -> Shaped[np.ndarray, " n"]:
-    """For each element, whether any value of any array is not zero."""
-    return np.array([any(np.any(row) for row in rows) for rows in zip(*arrays, strict=True)], bool)
-
-
-def _plugins(model: mujoco.MjModel) -> Iterator[str]:
-    for i in range(model.nplugin):
-        yield f"plugin instance {i}"
-
-
-def _disabled_motors(model: mujoco.MjModel) -> Shaped[np.ndarray, " motors"]:
-    """Motors of a group that `actuatorgroupdisable` names. Groups outside 0 to 30 cannot be disabled."""
-    group = model.actuator_group
-    return (group >= 0) & (group <= 30) & (model.opt.disableactuator >> np.clip(group, 0, 30) & 1).astype(bool)
-
-
-def _polynomial_joints(model: mujoco.MjModel) -> Shaped[np.ndarray, " joints"]:
-    """Joints whose stiffness or damping has terms of higher order."""
-    damping = _any(model.dof_dampingpoly)[model.jnt_dofadr] if model.njnt else np.zeros(0, bool)
-    return _any(model.jnt_stiffnesspoly) | damping
-
-
-def _fluid_geoms(model: mujoco.MjModel) -> Shaped[np.ndarray, " geoms"]:
-    """Geoms with fluid forces of their own, in a medium."""
-    has_medium = model.opt.density > 0 or model.opt.viscosity > 0
-    return (model.geom_fluid[:, 0] > 0) & has_medium
-
-
-def _moving_equalities(model: mujoco.MjModel) -> Shaped[np.ndarray, " equalities"]:
-    """Active equalities whose Jacobian changes with the position. MuJoCo adds a term for that change, MJX does not."""
-    is_off = model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    is_moving = np.isin(model.eq_type, (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD))
-    return is_moving & model.eq_active0.astype(bool) & (not is_off)
-
-
-_SPOKEN = {"actuator": "motor", "eq": "equality constraint"}
-
 _FEATURES = (
     _Feature(
         _EVERY,
-        _named("actuator", lambda m: m.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE),
+        elements.named("actuator", lambda m: m.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE),
         "actuators with an activation state",
         'set dyntype="none", or use <motor>, <position> or <velocity> without a time constant',
     ),
     _Feature(
         _EVERY,
-        _named("actuator", lambda m: _any(m.actuator_history)),
+        elements.named("actuator", lambda m: elements.any_of(m.actuator_history)),
         "actuators with a delay",
         "remove nsample and delay",
     ),
     _Feature(
         _EVERY,
-        _named("sensor", lambda m: _any(m.sensor_history)),
+        elements.named("sensor", lambda m: elements.any_of(m.sensor_history)),
         "sensors with a history",
         "remove nsample, delay and interval",
     ),
-    _Feature(_EVERY, _plugins, "plugins", "remove <extension> and the elements that use it"),
+    _Feature(_EVERY, elements.plugins, "plugins", "remove <extension> and the elements that use it"),
     _Feature(
         _EVERY,
-        _option('<flag sleep="enable"/>', lambda o: o.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP),
+        elements.option('<flag sleep="enable"/>', lambda o: o.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP),
         "sleeping bodies",
         "remove the flag",
     ),
     _Feature(
         _MJX,
-        _named("actuator", _disabled_motors),
+        elements.named("actuator", elements.disabled_motors),
         "disabled actuator groups",
         "remove actuatorgroupdisable, or the motor",
     ),
     _Feature(
         _MJX,
-        _named("actuator", lambda m: _any(m.actuator_armature)),
+        elements.named("actuator", lambda m: elements.any_of(m.actuator_armature)),
         "actuator armature",
         "set armature on the joint",
     ),
     _Feature(
         _MJX,
-        _named("eq", _moving_equalities),
+        elements.named("eq", elements.moving_equalities),
         "connect and weld constraints as MuJoCo does",
         "remove the constraint",
     ),
     _Feature(
+        _MJX,
+        elements.named("joint", elements.overlapping_joint_limits),
+        "both limits of a joint at the same time",
+        "set a margin below half the range",
+    ),
+    _Feature(
+        _MJX,
+        elements.named("tendon", elements.overlapping_tendon_limits),
+        "both limits of a tendon at the same time",
+        "set a margin below half the range",
+    ),
+    _Feature(
+        _MJX,
+        elements.named("body", elements.balanced_bodies),
+        "contacts of a body whose joints only turn it about its center of mass",
+        "move the body's joint or mass slightly",
+    ),
+    _Feature(
+        _MJX,
+        elements.named("tendon", elements.unmoved_tendons),
+        "a tendon with limits, friction or an equality that no joint moves in the model's own pose",
+        "remove them",
+    ),
+    _Feature(
         ("jax",),
-        _named("actuator", lambda m: _any(m.actuator_damping, m.actuator_dampingpoly)),
+        elements.named("actuator", lambda m: elements.any_of(m.actuator_damping, m.actuator_dampingpoly)),
         "actuator damping",
         "set damping on the joint",
     ),
     _Feature(
         ("jax",),
-        _named("joint", _polynomial_joints),
+        elements.named("joint", elements.polynomial_joints),
         "polynomial stiffness and damping",
         "give the joint one stiffness and one damping",
     ),
     _Feature(
         ("jax",),
-        _named("tendon", lambda m: _any(m.tendon_stiffnesspoly, m.tendon_dampingpoly)),
+        elements.named("tendon", lambda m: elements.any_of(m.tendon_stiffnesspoly, m.tendon_dampingpoly)),
         "polynomial stiffness and damping",
         "give the tendon one stiffness and one damping",
     ),
     _Feature(
         ("jax",),
-        _named("geom", lambda m: _any(m.geom_adhesion)),
+        elements.named("tendon", elements.branching_armatures),
+        "the armature of a tendon across branches as MuJoCo does",
+        "remove armature",
+    ),
+    _Feature(
+        ("jax",),
+        elements.named("geom", lambda m: elements.any_of(m.geom_adhesion)),
         "adhesion",
         "remove adhesion",
     ),
     _Feature(
         ("jax",),
-        _named("geom", lambda m: _any(m.geom_surfacevel)),
+        elements.named("geom", lambda m: elements.any_of(m.geom_surfacevel)),
         "moving surfaces",
         "remove surfacevel",
     ),
     _Feature(
         ("jax",),
-        _named("geom", _fluid_geoms),
+        elements.named("geom", elements.fluid_geoms),
         "the fluid forces of individual geoms",
         "remove fluidshape and fluidcoef",
     ),
     _Feature(
         ("jax",),
-        _option("noslip_iterations", lambda o: o.noslip_iterations > 0),
+        elements.option("noslip_iterations", lambda o: o.noslip_iterations > 0),
         "the noslip solver",
         "set noslip_iterations to 0 in <option>",
     ),

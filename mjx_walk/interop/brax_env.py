@@ -1,5 +1,6 @@
 """A task as a `brax.envs.Env`, for Brax's wrappers and trainers and for algorithms written against them."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -7,12 +8,36 @@ import jax.numpy as jnp
 from brax.base import System
 from brax.envs import base
 from brax.io import mjcf
+from mujoco import mjx
 
 from mjx_walk.envs import NO_TIME_LIMIT, make_env
 from mjx_walk.envs.physics.mjx_model import with_newton_solver
 from mjx_walk.envs.state import check_action_shape
 from mjx_walk.utils.compat import standard_dtypes
 from mjx_walk.utils.errors import UserError
+
+_MODEL_ARRAYS = {field.name for field in dataclasses.fields(mjx.Model)}
+_INSTEAD = {
+    "gravity": "opt.gravity",
+    "viscosity": "opt.viscosity",
+    "density": "opt.density",
+    "link.inertia.mass": "body_mass",
+    "link.inertia.i": "body_inertia",
+    "link.inertia.transform.pos": "body_ipos",
+    "link.inertia.transform.rot": "body_iquat",
+    "link.transform.pos": "body_pos",
+    "link.transform.rot": "body_quat",
+    "dof.armature": "dof_armature",
+    "dof.damping": "dof_damping",
+    "dof.stiffness": "jnt_stiffness",
+    "dof.limit": "jnt_range",
+    "actuator.gear": "actuator_gear",
+    "actuator.gain": "actuator_gainprm",
+    "actuator.bias_q": "actuator_biasprm",
+    "actuator.bias_qd": "actuator_biasprm",
+    "actuator.force_range": "actuator_forcerange",
+}
+"""What MJX reads instead of the values of Brax's own engines."""
 
 
 class BraxEnv(base.Env):
@@ -47,10 +72,11 @@ class BraxEnv(base.Env):
         """Brax's description of the model, with MJX's solver. The control range is that of the actions, [-1, 1].
 
         With `physics="jax"`, a changed one can be set, as Brax's `DomainRandomizationVmapWrapper` does. The physics
-        uses its values, and rewards that read the model's masses or time step keep the original ones.
+        uses its values, and rewards that read the model's masses or time step keep the original ones. Only arrays of
+        `mjx.Model` can change, such as `body_mass`, `actuator_gear` or `opt.gravity`.
 
         Raises:
-            UserError: on setting a changed one with another engine.
+            UserError: on setting a changed one with another engine, or with a change that the physics does not read.
         """
         if self._changed_sys is not None:
             return self._changed_sys
@@ -65,9 +91,10 @@ class BraxEnv(base.Env):
     def sys(self, sys: System) -> None:
         own = dict(jax.tree_util.tree_leaves_with_path(self._restored_sys()))
         leaves = jax.tree_util.tree_leaves_with_path(sys)
-        changes = {_dotted(path): leaf for path, leaf in leaves if leaf is not own[path]}
+        changes = {_dotted(path): leaf for path, leaf in leaves if leaf is not own.get(path)}
         if not changes:
             return
+        _check_changes(changes, {_dotted(path): leaf for path, leaf in own.items()})
         self._change_model(changes)
         self._changed_sys = sys
 
@@ -117,6 +144,22 @@ class BraxEnv(base.Env):
         return self._task.engine.name
 
 
+def _check_changes(changes: dict[str, jax.Array], own: dict[str, jax.Array]) -> None:
+    """Check that the physics reads what has changed.
+
+    Raises:
+        UserError: it does not, or an array has another shape.
+    """
+    for name, value in changes.items():
+        if name.partition(".")[0] not in _MODEL_ARRAYS:
+            found = next((new for old, new in _INSTEAD.items() if f"{name}.".startswith(f"{old}.")), None)
+            advice = f"{found} instead" if found else "an array of mjx.Model, such as body_mass or opt.gravity"
+            raise UserError(f"the physics does not read '{name}' of a Brax system; change {advice}")
+        if name not in own or jnp.shape(value) != jnp.shape(own[name]):
+            expected = f"has shape {jnp.shape(own[name])}" if name in own else "does not exist"
+            raise UserError(f"'{name}' of this model {expected}, not {jnp.shape(value)}; keep the shape of each array")
+
+
 def _dotted(path: tuple[Any, ...]) -> str:
     """Path of a leaf as `tree_replace` takes it, such as `opt.gravity`."""
-    return ".".join(key.name for key in path)
+    return jax.tree_util.keystr(path, simple=True, separator=".")

@@ -59,6 +59,21 @@ def path_of(model):
     return Path(spec.submodule_search_locations[0]) / folder / file
 
 
+@pytest.mark.parametrize("memory", ["1K", "2K", "5K", "20K", "4M"])
+def test_memory_suffices_or_is_refused(memory, tmp_path):
+    """MuJoCo ends with an error where a file names little memory, or loses contacts where it names a little more."""
+    text = path_of("Gymnasium hopper.xml").read_text().replace("<worldbody>", f'<size memory="{memory}"/><worldbody>')
+    path = tmp_path / "hopper.xml"
+    path.write_text(text)
+    if memory == "4M":
+        assert load_model(str(path)).narena == 4 * 2**20
+        return
+    with pytest.raises(UserError) as refused:
+        load_model(str(path))
+    advice = 'memory="…" in <size> is too little for its contacts and limits; remove it, and MuJoCo chooses'
+    assert str(refused.value) == f"{path}: {advice}"
+
+
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(("model", "name", "result"), MODELS)
 def test_equal_to_gymnasium_or_refused(model, name, result):

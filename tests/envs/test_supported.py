@@ -5,8 +5,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mujoco.mjx._src import collision_driver
 
-from mjx_walk.envs.physics import PhysicsState, make_engine
+from mjx_walk.envs.physics import PhysicsState, make_engine, static_pairs
+from mjx_walk.envs.physics.jax_model import adapt_model
+from mjx_walk.envs.physics.static_pairs import drop_static_pairs
 from mjx_walk.utils.errors import UserError
 
 PARTS = {
@@ -72,10 +75,41 @@ REFUSED = {
     "override": (MJX, {"option": 'o_margin=".02"', "flag": '<flag override="enable"/>'}, "does not support this model"),
     "diagexact": (MJX, {"flag": '<flag diagexact="enable"/>'}, "does not support this model"),
     "autoreset": (WARP, {"flag": '<flag autoreset="disable"/>'}, "does not support this model"),
+    "limit_margin": (
+        MJX,
+        {"knee": 'range="-5 6" margin=".2"'},
+        "both limits of a joint at the same time (joint 'knee'); set a margin below half the range",
+    ),
+    "tendon_limit_margin": (
+        MJX,
+        {"tendon": FIXED.format('range="-.05 .05" margin=".2"')},
+        "both limits of a tendon at the same time (tendon 't')",
+    ),
+    "wheel": (
+        MJX,
+        {"world": '<body name="wheel" pos="2 0 .1"><joint axis="0 1 0"/><geom size=".12"/></body>'},
+        "contacts of a body whose joints only turn it about its center of mass (body 'wheel')",
+    ),
+    "static_tendon": (
+        MJX,
+        {
+            "world": '<site name="one"/><site name="two" pos="1 0 0"/>',
+            "tendon": '<spatial name="s" range="0 .1"><site site="one"/><site site="two"/></spatial>',
+        },
+        "that no joint moves in the model's own pose (tendon 's')",
+    ),
     "damping": (JAX, {"motor": MOTOR.format('damping=".2"')}, "actuator damping (motor 'm')"),
     "dampingpoly": (JAX, {"knee": 'damping=".1 .2 .05"'}, "stiffness and damping (joint 'knee')"),
     "stiffnesspoly": (JAX, {"knee": 'stiffness="1 5 3"'}, "stiffness and damping (joint 'knee')"),
     "tendonpoly": (JAX, {"tendon": SPATIAL.format('damping="1 .5 .5"')}, "stiffness and damping (tendon 't')"),
+    "branching_armature": (
+        JAX,
+        {
+            "world": '<body><joint name="b"/><geom size=".1" pos=".2 0 2"/></body>',
+            "tendon": '<fixed name="t" armature="1"><joint joint="b" coef="1"/><joint joint="knee" coef="1"/></fixed>',
+        },
+        "the armature of a tendon across branches as MuJoCo does (tendon 't')",
+    ),
     "adhesion": (JAX, {"torso": f'{SPHERE} adhesion="4"'}, "adhesion (geom 'torso')"),
     "surfacevel": (JAX, {"floor": 'surfacevel="1 0 0 0 0 0"'}, "moving surfaces (geom 'floor')"),
     "ellipsoid_fluid": (
@@ -125,13 +159,23 @@ SIMULATED = {
     "tendon_equality": {"tendon": FIXED.format(""), "equality": '<tendon tendon1="t"/>'},
     "joint_equality": {"equality": '<joint joint1="hinge" joint2="knee" polycoef="0 .5 1 .5 0"/>'},
     "inactive_weld": {"equality": '<weld body1="shin" active="false"/>'},
-    "mocap": {"world": '<body mocap="true" pos=".3 0 .1"><geom type="sphere" size=".08"/></body>'},
+    "mocap": {
+        "world": '<body mocap="true" pos=".3 0 .1"><geom type="sphere" size=".08"/></body>'
+        '<body mocap="true" pos="3 0 .05"><geom name="far" size=".08"/></body><geom name="x" size=".1" pos="4 0 0"/>',
+        "contact": '<pair geom1="x" geom2="far" margin="2"/><pair geom1="x" geom2="floor"/>',
+    },
     "wind": {"option": 'density="5" viscosity=".5" wind="3 0 0"'},
     "no_filterparent": {"flag": '<flag filterparent="disable"/>'},
-    "no_clampctrl": {"flag": '<flag clampctrl="disable"/>'},
+    "no_clampctrl_no_damper": {
+        "flag": '<flag clampctrl="disable" damper="disable"/>',
+        "knee": 'damping="1" stiffness="5"',
+    },
     "no_eulerdamp": {"flag": '<flag eulerdamp="disable"/>', "knee": 'damping="1"'},
     "no_refsafe": {"flag": '<flag refsafe="disable"/>', "torso": f'{SPHERE} solref=".004 1"'},
-    "no_warmstart": {"flag": '<flag warmstart="disable"/>'},
+    "no_warmstart_no_spring": {
+        "flag": '<flag warmstart="disable" spring="disable"/>',
+        "knee": 'damping="1" stiffness="20"',
+    },
 }
 """Parts of models that every engine simulates."""
 
@@ -149,6 +193,25 @@ def test_refused_by_name(name):
         assert says in str(refused.value) and "\n" not in str(refused.value)
     if "c" not in engines:
         make_engine("c", load(parts), 1, ())
+
+
+def test_contacts_between_bodies_that_cannot_move_are_dropped():
+    model = load(SIMULATED["mocap"])
+    drop_static_pairs(model)
+    assert (model.pair_margin == -1e10).all()
+    static_pairs.install()
+    bodies = [model.geom_bodyid[list(pair[:2])] for pair in collision_driver.geom_pairs(model)]
+    assert bodies and all(model.body_dofnum[pair].any() for pair in bodies)
+
+
+@pytest.mark.parametrize(
+    ("flags", "kept"), [((), (True, True)), (("spring",), (False, True)), (("damper",), (True, False))]
+)
+def test_spring_and_damper_flags_on_the_jax_engine(flags, kept):
+    disabled = " ".join(f'{flag}="disable"' for flag in flags)
+    model = load({"flag": f"<flag {disabled}/>", "knee": 'stiffness="5" damping="1"'})
+    adapt_model(model)
+    assert (model.jnt_stiffness.any(), model.dof_damping.any()) == kept and not model.opt.disableflags
 
 
 def visited(model, num_envs=8, num_steps=10):
@@ -184,7 +247,7 @@ def test_simulated_as_by_the_c_engine(name, engine):
 
 def test_environments_of_the_c_engine_do_not_share_a_state():
     """A resting environment stays the same, whatever its neighbor does."""
-    model = load({"world": SIMULATED["mocap"]["world"], "equality": '<weld body1="shin" active="true"/>'})
+    model = load({**SIMULATED["mocap"], "equality": '<weld body1="shin" active="true"/>'})
     step = jax.jit(jax.vmap(make_engine("c", model, 1, ()).step))
     state = PhysicsState(*(jnp.tile(jnp.float32(x), (2, 1)) for x in (model.qpos0, np.zeros(4), np.zeros(4))))
     alone, acting = state, state

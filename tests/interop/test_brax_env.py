@@ -1,5 +1,8 @@
 """The tasks through Brax's interface."""
 
+import operator
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -69,6 +72,24 @@ def test_domain_randomization_needs_an_engine_that_can_change_its_model():
     env = training.DomainRandomizationVmapWrapper(BraxEnv("walker2d", physics="c"), masses_times_half_one_and_two)
     with pytest.raises(UserError, match=r"use BraxEnv.*physics='jax'"):
         env.reset(jax.random.split(jax.random.PRNGKey(0), 3))
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("link.inertia.mass", "'link.inertia.mass' of a Brax system; change body_mass instead"),
+        ("actuator.gear", "'actuator.gear' of a Brax system; change actuator_gear instead"),
+        ("dof.limit", "'dof.limit.0' of a Brax system; change jnt_range instead"),
+        ("elasticity", "'elasticity' of a Brax system; change an array of mjx.Model, such as body_mass or opt.gravity"),
+    ],
+)
+def test_randomization_that_the_physics_does_not_read(name, advice):
+    env = BraxEnv("inverted_pendulum", physics="jax")
+    changed = jax.tree.map(lambda x: 2 * x, operator.attrgetter(name)(env.sys))
+    with pytest.raises(UserError, match=re.escape(f"the physics does not read {advice}")):
+        env.sys = env.sys.tree_replace({name: changed})
+    with pytest.raises(UserError, match=r"'body_mass' of this model has shape \(3,\), not \(1,\)"):
+        env.sys = env.sys.replace(body_mass=jnp.ones(1))
 
 
 @pytest.mark.slow

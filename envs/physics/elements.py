@@ -1,0 +1,136 @@
+"""Elements of a model that use a feature, for the table of `supported`."""
+
+import itertools
+from collections.abc import Callable, Iterator
+
+import mujoco
+import numpy as np
+from jaxtyping import Shaped
+
+Users = Callable[[mujoco.MjModel], Iterator[str]]
+"""The elements of a model that use a feature, as `kind 'name'`."""
+
+_SPOKEN = {"actuator": "motor", "eq": "equality constraint"}
+
+
+def named(
+    kind: str, is_user: Callable[[mujoco.MjModel], Shaped[np.ndarray, " n"]]
+) -> Callable[[mujoco.MjModel], Iterator[str]]:
+    """The elements of one kind for which a condition on the model's arrays holds."""
+
+    def users(model: mujoco.MjModel) -> Iterator[str]:
+        for i in np.flatnonzero(is_user(model)):
+            name = getattr(model, kind)(int(i)).name
+            yield f"{_SPOKEN.get(kind, kind)} '{name}'" if name else f"{_SPOKEN.get(kind, kind)} {i}"
+
+    return users
+
+
+def option(
+    text: str, is_used: Callable[[mujoco.MjOption], bool | int | float]
+) -> Callable[[mujoco.MjModel], Iterator[str]]:
+    """The `<option>` for which a condition holds."""
+
+    def users(model: mujoco.MjModel) -> Iterator[str]:
+        if is_used(model.opt):
+            yield text
+
+    return users
+
+
+def any_of(*arrays: Shaped[np.ndarray, "n ..."]) -> Shaped[np.ndarray, " n"]:
+    """For each element, whether any value of any array is not zero."""
+    return np.array([any(np.any(row) for row in rows) for rows in zip(*arrays, strict=True)], bool)
+
+
+def plugins(model: mujoco.MjModel) -> Iterator[str]:
+    for i in range(model.nplugin):
+        yield f"plugin instance {i}"
+
+
+def disabled_motors(model: mujoco.MjModel) -> Shaped[np.ndarray, " motors"]:
+    """Motors of a group that `actuatorgroupdisable` names. Groups outside 0 to 30 cannot be disabled."""
+    group = model.actuator_group
+    return (group >= 0) & (group <= 30) & (model.opt.disableactuator >> np.clip(group, 0, 30) & 1).astype(bool)
+
+
+def polynomial_joints(model: mujoco.MjModel) -> Shaped[np.ndarray, " joints"]:
+    """Joints whose stiffness or damping has terms of higher order."""
+    damping = any_of(model.dof_dampingpoly)[model.jnt_dofadr] if model.njnt else np.zeros(0, bool)
+    return any_of(model.jnt_stiffnesspoly) | damping
+
+
+def fluid_geoms(model: mujoco.MjModel) -> Shaped[np.ndarray, " geoms"]:
+    """Geoms with fluid forces of their own, in a medium."""
+    has_medium = model.opt.density > 0 or model.opt.viscosity > 0
+    return (model.geom_fluid[:, 0] > 0) & has_medium
+
+
+def moving_equalities(model: mujoco.MjModel) -> Shaped[np.ndarray, " equalities"]:
+    """Active equalities whose Jacobian changes with the position. MuJoCo adds a term for that change, MJX does not."""
+    is_off = model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    is_moving = np.isin(model.eq_type, (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD))
+    return is_moving & model.eq_active0.astype(bool) & (not is_off)
+
+
+def overlapping_joint_limits(model: mujoco.MjModel) -> Shaped[np.ndarray, " joints"]:
+    """Joints whose upper and lower limit can act at the same time. MJX has one row for both, MuJoCo has two."""
+    is_scalar = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE))
+    return is_scalar & _overlap(model, model.jnt_limited, model.jnt_range, model.jnt_margin)
+
+
+def overlapping_tendon_limits(model: mujoco.MjModel) -> Shaped[np.ndarray, " tendons"]:
+    """Tendons whose upper and lower limit can act at the same time."""
+    return _overlap(model, model.tendon_limited, model.tendon_range, model.tendon_margin)
+
+
+def _overlap(
+    model: mujoco.MjModel,
+    limited: Shaped[np.ndarray, " n"],
+    limits: Shaped[np.ndarray, "n 2"],
+    margin: Shaped[np.ndarray, " n"],
+) -> Shaped[np.ndarray, " n"]:
+    """Whether both limits can act at the same time."""
+    is_on = not model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    return (limited != 0) & (limits[:, 1] - limits[:, 0] < 2 * margin) & is_on
+
+
+def unmoved_tendons(model: mujoco.MjModel) -> Shaped[np.ndarray, " tendons"]:
+    """Constrained tendons without inertia in the model's own pose. MJX's solver divides by it."""
+    is_constrained = (model.tendon_limited != 0) | (model.tendon_frictionloss > 0)
+    is_tendon = model.eq_type == mujoco.mjtEq.mjEQ_TENDON
+    for tied in (model.eq_obj1id[is_tendon], model.eq_obj2id[is_tendon]):
+        is_constrained[tied[tied >= 0]] = True
+    return is_constrained & (model.tendon_invweight0 < mujoco.mjMINVAL)
+
+
+def branching_armatures(model: mujoco.MjModel) -> Shaped[np.ndarray, " tendons"]:
+    """Tendons with armature that couple joints of different branches. C leaves out such entries of the mass matrix."""
+    is_on_chain = np.array([_is_chain(model, _dofs_of(model, tendon)) for tendon in range(model.ntendon)], bool)
+    return (model.tendon_armature > 0) & ~is_on_chain
+
+
+def _dofs_of(model: mujoco.MjModel, tendon: int) -> Shaped[np.ndarray, " n"]:
+    """Ascending degrees of freedom that can change a tendon's length."""
+    first = model.ten_J_rowadr[tendon]
+    return model.ten_J_colind[first : first + model.ten_J_rownnz[tendon]]
+
+
+def _is_chain(model: mujoco.MjModel, dofs: Shaped[np.ndarray, " n"]) -> bool:
+    """Whether each degree of freedom is an ancestor of the next."""
+    for ancestor, dof in itertools.pairwise(dofs):
+        while dof > ancestor:
+            dof = model.dof_parentid[dof]
+        if dof != ancestor:
+            return False
+    return True
+
+
+def balanced_bodies(model: mujoco.MjModel) -> Shaped[np.ndarray, " bodies"]:
+    """Moving bodies with contacts whose centre of mass no joint moves. MJX's solver divides by their inertia, zero."""
+    moves = model.body_dofnum[model.body_weldid] > 0
+    collides = np.zeros(model.nbody, bool)
+    collides[model.geom_bodyid[(model.geom_contype | model.geom_conaffinity) != 0]] = True
+    collides[model.geom_bodyid[[*model.pair_geom1, *model.pair_geom2]]] = True
+    is_off = model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    return moves & collides & (model.body_invweight0[:, 0] < mujoco.mjMINVAL) & (not is_off)

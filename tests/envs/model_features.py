@@ -1,0 +1,197 @@
+"""Command: every feature of `feature_models`, alone and with others, on an MJX engine against the `c` engine.
+
+    python tests/envs/model_features.py --engines jax --settings no_damper --groups joint tendon --pairs
+
+A setting is an option or a flag. Each run is a world with one setting, where many small models with one feature (with
+`--pairs`: with two) stand apart. A case is `equal`, `differs`, `refused` in one line, an `error`, or `invalid`: MuJoCo
+refuses the model. It prints what differs and a table of counts, and exits with code 1 if a case differs or fails.
+"""
+
+import argparse
+import collections
+import itertools
+import os
+import sys
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import feature_models
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from feature_models import Features
+from features import FLAGS, GROUPS, OPTIONS
+
+from mjx_walk.envs.physics import PhysicsState, make_engine, mjx_model
+from mjx_walk.envs.physics.supported import refuse_unsupported
+from mjx_walk.utils.errors import UserError
+
+NUM_SUBSTEPS = 4
+LARGEST_ERROR = 2e-3
+"""Of velocities, relative to one plus their change; 90% of the states may not exceed it."""
+
+
+class Case(NamedTuple):
+    """One model on one engine."""
+
+    engine: str
+    integrator: str
+    features: Features
+
+
+class Outcome(NamedTuple):
+    """What an engine makes of it."""
+
+    kind: str
+    detail: str = ""
+
+
+def visited(model: mujoco.MjModel, num_envs: int = 8, num_steps: int = 3):
+    """States on trajectories of the `c` engine under random controls, and the controls."""
+    rng = np.random.default_rng(0)
+    qpos = model.qpos0 + 0.02 * rng.normal(size=(num_envs, model.nq))
+    qvel = 0.5 * rng.normal(size=(num_envs, model.nv))
+    state = PhysicsState(jnp.float32(qpos), jnp.float32(qvel), jnp.zeros((num_envs, model.nv)))
+    step = jax.jit(jax.vmap(make_engine("c", model, 3, ()).step))
+    states, controls = [], []
+    for _ in range(num_steps):
+        states.append(state)
+        controls.append(jnp.float32(rng.uniform(-2, 2, (num_envs, model.nu))))
+        state = step(state, controls[-1])[0]
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *states), jnp.concatenate(controls)
+
+
+def errors(model: mujoco.MjModel, engine: str, owners: list[int]) -> list[np.ndarray]:
+    """Errors of velocities after a step, relative to one plus the change of the exhibit's fastest.
+
+    Args:
+        model: a gallery.
+        engine: to compare with `c`.
+        owners: the exhibit of each degree of freedom.
+
+    Returns:
+        For each exhibit, the largest error in each visited state.
+    """
+    states, controls = visited(model)
+    expected, found = (
+        np.asarray(jax.jit(jax.vmap(make_engine(one, model, NUM_SUBSTEPS, ()).step))(states, controls)[0].qvel)
+        for one in ("c", engine)
+    )
+    by_exhibit = []
+    for exhibit in range(max(owners) + 1):
+        own = np.array(owners) == exhibit
+        change = np.abs(expected - states.qvel)[:, own].max(axis=1)
+        by_exhibit.append(np.abs(found - expected)[:, own].max(axis=1) / (1 + change))
+    return by_exhibit
+
+
+def refusal(case: Case, settings: Features) -> Outcome | None:
+    """The outcome of a case that needs no simulation."""
+    try:
+        model = feature_models.load(*settings, *case.features, option=f'integrator="{case.integrator}"')
+    except ValueError as error:
+        return Outcome("invalid", str(error).splitlines()[0])
+    try:
+        refuse_unsupported(model, case.engine)
+    except UserError as error:
+        return Outcome("error" if "\n" in str(error) else "refused", str(error))
+    return None
+
+
+def outcomes(cases: list[Case], settings: Features) -> Iterator[tuple[Case, Outcome]]:
+    """Outcomes of cases of one engine and integrator, with the same settings."""
+    rest = []
+    for case in cases:
+        refused = refusal(case, settings)
+        if refused:
+            yield case, refused
+        else:
+            rest.append(case)
+    if rest:
+        yield from _simulated(rest, settings)
+
+
+def _simulated(cases: list[Case], settings: Features) -> Iterator[tuple[Case, Outcome]]:
+    engine, integrator, _ = cases[0]
+    size = 10 if engine == "warp" else 31
+    shared = [case for case in cases if feature_models.is_local(case.features)]
+    rooms = [shared[i : i + size] for i in range(0, len(shared), size)]
+    for room in [*rooms, *([case] for case in cases if case not in shared)]:
+        option = f'integrator="{integrator}" jacobian="dense"'
+        if room[0] in shared:
+            model = feature_models.gallery([case.features for case in room], settings, option=option)
+            owners = feature_models.exhibit_of_dofs(model)
+        else:
+            model = feature_models.load(*settings, *room[0].features, option=option)
+            owners = [0] * model.nv
+        try:
+            found = errors(model, engine, owners)
+        except Exception as error:
+            if len(room) > 1:
+                half = len(room) // 2
+                yield from _simulated(room[:half], settings)
+                yield from _simulated(room[half:], settings)
+                continue
+            kind = "refused" if isinstance(error, UserError) and "\n" not in str(error) else "error"
+            yield room[0], Outcome(kind, f"{type(error).__name__}: {str(error)[:200]}")
+            continue
+        finally:
+            jax.clear_caches()
+        for case, each in zip(room, found, strict=True):
+            quantiles = np.quantile(each, (0.5, 0.9, 1.0))
+            text = "median {:.1e}, 90% {:.1e}, largest {:.1e}".format(*quantiles)
+            yield case, Outcome("equal" if quantiles[1] < LARGEST_ERROR else "differs", text)
+
+
+def compile_quickly() -> None:
+    """Tell XLA to compile quickly, on the CPU unless the user chooses."""
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    flags = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+    os.environ["XLA_FLAGS"] = f"{flags} {os.environ.get('XLA_FLAGS', '')}"
+
+
+def let_solver_converge() -> None:
+    """Give MJX's solver and Warp's buffers what a world of many models needs."""
+    mjx_model.MIN_SOLVER_ITERATIONS = 60
+    try:
+        from mjx_walk.envs.physics import mjx_warp
+    except ImportError:
+        return
+    mjx_warp.CONTACTS_PER_ENV, mjx_warp.CONSTRAINTS_PER_ENV = 200, 800
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--engines", nargs="+", default=["jax", "warp"])
+    parser.add_argument("--integrators", nargs="+", default=["Euler", "RK4"])
+    parser.add_argument("--settings", nargs="+", default=["none"], help="such as no_spring+no_damper, none, or all")
+    parser.add_argument("--groups", nargs="+", default=[*GROUPS], help="of features")
+    parser.add_argument("--features", nargs="+", help="instead of groups")
+    parser.add_argument("--pairs", action="store_true")
+    parser.add_argument("--verbose", action="store_true", help="print every case")
+    given = parser.parse_args()
+    compile_quickly()
+    let_solver_converge()
+    names = given.features or [
+        name for group in given.groups if group not in ("flag", "option") for name in GROUPS[group]
+    ]
+    sets = [*itertools.combinations(names, 2)] if given.pairs else [(name,) for name in names]
+    settings = given.settings
+    if settings == ["all"]:
+        settings = ["none", *FLAGS, *OPTIONS]
+    counts: collections.Counter = collections.Counter()
+    for setting, engine, integrator in itertools.product(settings, given.engines, given.integrators):
+        cases = [Case(engine, integrator, each) for each in sets]
+        for case, found in outcomes(cases, () if setting == "none" else tuple(setting.split("+"))):
+            counts[engine, found.kind] += 1
+            if given.verbose or found.kind in ("differs", "error"):
+                named = " × ".join((setting, *case.features))
+                print(f"{engine} {integrator} {named}: {found.kind} {found.detail}", flush=True)
+    for (engine, kind), count in sorted(counts.items()):
+        print(f"{engine}: {count} {kind}")
+    return int(any(kind in ("differs", "error") for _, kind in counts))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
