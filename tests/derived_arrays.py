@@ -1,0 +1,293 @@
+"""Compare every array of `mjData` on every engine with MuJoCo's, at a reset and after a step.
+
+    python tests/derived_arrays.py [--engines c jax warp] [--models NAME ...] [--alone]
+
+It prints a table of arrays by engine and moment: equal, refused, or the largest error relative to the largest value.
+The reference does what Gymnasium does: `mj_forward` at a reset; `mj_step`, then `mj_rnePostConstraint`, in a step.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjx_walk.envs import models
+from mjx_walk.envs.physics import PhysicsState, make_engine
+from mjx_walk.envs.physics.derived_arrays import LATE_ARRAYS, refuse_derived
+from mjx_walk.utils.compat import prepare_jax
+from mjx_walk.utils.errors import UserError
+
+ENGINES = ("c", "jax", "warp")
+MOMENTS = ("reset", "step")
+NUM_SUBSTEPS = 2
+TOLERANCE = {"c": 1e-6, "jax": 2e-3, "warp": 2e-3}
+"""Largest error of an equal array, relative to its largest value. MJX computes in float32."""
+
+RICH = """
+<mujoco>
+  <option timestep="0.004" iterations="100" {option}><flag {flag}/></option>
+  <size nuserdata="3"/>
+  <worldbody>
+    <light pos="0 0 3" mode="targetbody" target="torso"/>
+    <camera name="fixed" pos="0 -3 1"/>
+    <camera pos="0 -3 1" mode="trackcom"/>
+    <geom type="plane" size="5 5 .1"/>
+    <body name="torso" pos="0 0 {height}">
+      <freejoint/>
+      <camera name="eye" pos="0 0 .1" mode="targetbody" target="tool"/>
+      <light pos="0 0 .3" mode="trackcom"/>
+      <geom type="capsule" size=".05" fromto="-.15 0 0 .15 0 0"/>
+      <geom name="pulley" type="sphere" size=".02" pos=".25 0 .1" contype="0" conaffinity="0"/>
+      <site name="back" pos="0 0 .1"/>
+      <body name="shin" pos=".3 0 0" gravcomp=".5">
+        <joint name="knee" axis="0 1 0" stiffness="2" damping=".3" armature=".02" frictionloss=".1" range="-40 40"/>
+        <geom name="shin" type="capsule" size=".04" fromto="0 0 0 .3 0 .05"/>
+        <site name="tip" pos=".3 0 .05"/>
+        <body pos=".35 0 .05">
+          <joint name="ball" type="ball" damping=".1"/>
+          <geom type="sphere" size=".06"/>
+          <site name="end" pos=".1 .02 0" size=".03"/>
+        </body>
+      </body>
+      <body name="arm" pos="-.3 0 0">
+        <joint name="arm" axis="1 0 1" damping=".2"/>
+        <joint type="slide" axis="1 0 0" damping=".5" stiffness="20"/>
+        <geom name="arm" type="capsule" size=".04" fromto="0 0 0 -.3 0 .05"/>
+        <site name="hand" pos="-.3 0 .05"/>
+      </body>
+    </body>
+    <body name="tool" mocap="true" pos=".6 .5 .5"><geom type="sphere" size=".05" contype="0" conaffinity="0"/></body>
+    <body pos="2 2 1"><geom type="sphere" size=".1"/><body pos="0 0 .2"><geom type="sphere" size=".1"/></body></body>
+    <body pos="-2 0 1"><joint axis="0 1 0"/><geom type="capsule" size=".03" fromto="0 0 0 .2 0 -.3"/></body>
+  </worldbody>
+  {tendon}
+  <equality>
+    <joint joint1="arm" joint2="knee" polycoef="0 .5 1 .5 0"/>
+    <weld body1="arm" active="false"/>
+  </equality>
+  <actuator>
+    <motor name="m" joint="knee" gear="2" ctrlrange="-1 1"/>
+    <position name="p" joint="arm" kp="5" kv="1" ctrlrange="-1 1"/>
+    {motor}
+  </actuator>
+  <sensor>{sensor}</sensor>
+</mujoco>
+"""
+"""All kinds of joints, contacts, limits, friction, equality, mocap and static bodies, cameras and lights."""
+FIXED = """<fixed name="t" stiffness="1" damping=".2" range="-.1 .1" limited="true">
+  <joint joint="arm" coef="1"/><joint joint="knee" coef="-.7"/></fixed>"""
+SPATIAL = """<spatial name="s" stiffness="10" damping="1" springlength=".1 .2">
+  <site site="back"/><geom geom="pulley"/><site site="tip"/></spatial>
+<spatial range="0 .5" limited="true" frictionloss=".1" armature=".3"><site site="hand"/><site site="back"/></spatial>"""
+FORCE_SENSORS = '<accelerometer site="tip"/><force site="tip"/><torque site="hand"/><touch site="end"/>'
+SENSORS = {
+    **{kind: f'<{kind} site="tip"/>' for kind in ("accelerometer", "velocimeter", "gyro", "force", "magnetometer")},
+    **{kind: f'<{kind} joint="knee"/>' for kind in ("jointpos", "jointvel", "jointactuatorfrc")},
+    **{kind: f'<{kind} joint="knee"/>' for kind in ("jointlimitpos", "jointlimitvel", "jointlimitfrc")},
+    **{kind: f'<{kind} tendon="t"/>' for kind in ("tendonpos", "tendonvel", "tendonactuatorfrc")},
+    **{kind: f'<{kind} tendon="t"/>' for kind in ("tendonlimitpos", "tendonlimitvel", "tendonlimitfrc")},
+    **{kind: f'<{kind} actuator="p"/>' for kind in ("actuatorpos", "actuatorvel", "actuatorfrc")},
+    **{kind: f'<{kind} joint="ball"/>' for kind in ("ballquat", "ballangvel")},
+    **{
+        kind: f'<{kind} objtype="site" objname="tip" reftype="body" refname="arm"/>'
+        for kind in ("framepos", "framequat")
+    },
+    **{kind: f'<{kind} objtype="geom" objname="arm"/>' for kind in ("framexaxis", "frameyaxis", "framezaxis")},
+    **{
+        kind: f'<{kind} objtype="site" objname="tip" reftype="body" refname="arm"/>'
+        for kind in ("framelinvel", "frameangvel")
+    },
+    **{kind: f'<{kind} objtype="body" objname="shin"/>' for kind in ("framelinacc", "frameangacc")},
+    **{kind: f'<{kind} body="shin"/>' for kind in ("subtreecom", "subtreelinvel", "subtreeangmom")},
+    **{kind: f'<{kind} geom1="shin" geom2="arm" cutoff="2"/>' for kind in ("distance", "normal", "fromto")},
+    **{kind: f"<{kind}/>" for kind in ("e_potential", "e_kinetic", "clock")},
+    "torque": '<torque site="hand"/>',
+    "touch": '<touch site="end"/>',
+    "rangefinder": '<rangefinder site="back"/>',
+    "camprojection": '<camprojection site="tip" camera="fixed"/>',
+    "insidesite": '<insidesite site="end" objtype="site" objname="tip"/>',
+    "contact": '<contact geom1="arm" num="2" data="found force dist pos normal"/>',
+    "user": '<user dim="2" needstage="acc"/>',
+    "cutoff": '<jointvel joint="knee" cutoff=".1"/>',
+}
+"""One sensor of each kind."""
+SUBTREE_SENSORS = '<subtreelinvel body="torso"/><subtreeangmom body="shin"/><subtreecom body="torso"/>'
+
+
+def rich(
+    integrator: str = "Euler", height: float = 0.05, option: str = "", text: str = RICH, **parts: str
+) -> mujoco.MjModel:
+    """The model `RICH` with other parts."""
+    parts = {"tendon": "", "motor": "", "sensor": "", "flag": 'contact="enable"'} | parts
+    if parts["tendon"]:
+        parts["tendon"] = f"<tendon>{parts['tendon']}</tendon>"
+    option = f'integrator="{integrator}" {option}'
+    return mujoco.MjModel.from_xml_string(text.format(option=option, height=height, **parts))
+
+
+MODELS: dict[str, Callable[[], mujoco.MjModel]] = {
+    "half_cheetah": lambda: models.load_model("half_cheetah.xml"),
+    "humanoid": lambda: models.load_model("humanoid.xml"),
+    "air": lambda: rich(height=2),
+    "floor": rich,
+    "rk4": lambda: rich("RK4"),
+    "elliptic": lambda: rich(option='cone="elliptic" impratio="5"'),
+    "fluid": lambda: rich(option='density="500" viscosity=".5" wind="1 0 0"'),
+    "no_gravity": lambda: rich(flag='gravity="disable"'),
+    "energy": lambda: rich(flag='energy="enable" fwdinv="enable"'),
+    "fixed_tendon": lambda: rich(tendon=FIXED, motor='<motor tendon="t" ctrlrange="-1 1"/>'),
+    "spatial_tendon": lambda: rich(tendon=SPATIAL, motor='<motor tendon="s" ctrlrange="-1 1"/>'),
+    "spatial_tendon_rk4": lambda: rich("RK4", tendon=SPATIAL),
+    "force_sensors": lambda: rich(sensor=FORCE_SENSORS),
+    "force_sensors_rk4": lambda: rich("RK4", sensor=FORCE_SENSORS),
+    "no_sensors": lambda: rich(sensor=FORCE_SENSORS, flag='sensor="disable"'),
+    "subtree_sensors": lambda: rich(sensor=SUBTREE_SENSORS),
+    "subtree_sensors_rk4": lambda: rich("RK4", sensor=SUBTREE_SENSORS),
+}
+
+
+def sensors(*kinds: str) -> mujoco.MjModel:
+    """A model with these sensors, at the limits of a joint and a tendon."""
+    tendon, parts = FIXED.replace("-.1 .1", "-.001 .001"), "".join(SENSORS[kind] for kind in kinds)
+    text = RICH.replace("-40 40", "-.5 .5").replace('size=".03"', 'size=".2"')
+    return rich(text=text, tendon=tendon, sensor=parts, motor='<motor tendon="t" ctrlrange="-1 1"/>')
+
+
+class Case(NamedTuple):
+    """A state, a control, and MuJoCo's arrays at both moments."""
+
+    state: PhysicsState
+    ctrl: np.ndarray
+    reset: dict[str, np.ndarray]
+    step: dict[str, np.ndarray]
+
+
+def array_names(model: mujoco.MjModel) -> list[str]:
+    """All arrays of `mjData`, the contacts, and the time."""
+    data = mujoco.MjData(model)
+    arrays = (name for name in dir(data) if isinstance(getattr(data, name), np.ndarray))
+    return [*arrays, "contact", "time"]
+
+
+def reference_cases(model: mujoco.MjModel, num_cases: int = 6, every: int = 12) -> list[Case]:
+    """Cases of one trajectory under random controls, with float32 states. As in Gymnasium, one `MjData` lives on."""
+    rng, data, fresh = np.random.default_rng(0), mujoco.MjData(model), mujoco.MjData(model)
+    names = array_names(model)
+    data.qpos[:] = model.qpos0 + 0.02 * rng.normal(size=model.nq)
+    data.qvel[:] = 0.5 * rng.normal(size=model.nv)
+    cases = []
+    for i in range(num_cases * every):
+        state = PhysicsState(*(np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart)))
+        ctrl = np.float32(rng.uniform(-1, 1, model.nu))
+        mujoco.mj_resetData(model, fresh)
+        _set(fresh, state)
+        mujoco.mj_forward(model, fresh)
+        _set(data, state)
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(model, data, nstep=NUM_SUBSTEPS)
+        mujoco.mj_rnePostConstraint(model, data)
+        if i % every == every - 1:
+            cases.append(Case(state, ctrl, *({name: _copy(one, name) for name in names} for one in (fresh, data))))
+    return cases
+
+
+def _set(data: mujoco.MjData, state: PhysicsState) -> None:
+    data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = state
+
+
+def _copy(data: mujoco.MjData, name: str) -> Any:
+    value = getattr(data, name)
+    return np.array(value, np.float64) if isinstance(value, np.ndarray) else value
+
+
+def accepted(model: mujoco.MjModel, engine: str, names: list[str]) -> Iterator[str]:
+    """The arrays that an engine does not refuse, each tried by itself."""
+    for name in names:
+        try:
+            refuse_derived(model, engine, (name,))
+        except UserError as error:
+            if "\n" in str(error) or f"'{name}'" not in str(error):
+                raise ValueError(f"not one line that names the array: {error}") from error
+            continue
+        yield name
+
+
+def errors(model: mujoco.MjModel, engine: str, names: tuple[str, ...], cases: list[Case]) -> dict[str, list[float]]:
+    """Largest errors by name at both moments, relative to the array's largest value, or absolute if that is zero."""
+    made = make_engine(engine, model, NUM_SUBSTEPS, names)
+    state = PhysicsState(*(jnp.asarray(np.stack(x)) for x in zip(*(case.state for case in cases), strict=True)))
+    ctrl = jnp.asarray(np.stack([case.ctrl for case in cases]))
+    found = (jax.jit(jax.vmap(made.forward))(state), jax.jit(jax.vmap(made.step))(state, ctrl)[1])
+    return {
+        name: [
+            _error(np.stack([getattr(case, moment)[name] for case in cases]), np.asarray(at_moment[name]))
+            for moment, at_moment in zip(MOMENTS, found, strict=True)
+        ]
+        for name in names
+    }
+
+
+def _error(expected: np.ndarray, found: np.ndarray) -> float:
+    assert found.dtype == np.float32 and found.shape == expected.shape
+    scale = np.abs(expected).max(initial=0.0)
+    return float(np.abs(found - expected).max(initial=0.0) / (scale or 1.0))
+
+
+def sweep(model: mujoco.MjModel, engine: str, is_alone: bool) -> dict[str, list[float]]:
+    """Errors of all arrays that an engine does not refuse. `LATE_ARRAYS` are compiled alone, and all if asked to."""
+    names = list(accepted(model, engine, array_names(model)))
+    alone = names if is_alone else [name for name in names if name in LATE_ARRAYS]
+    groups = [*((name,) for name in alone), tuple(name for name in names if name not in alone)]
+    cases, found = reference_cases(model), {}
+    for group in filter(None, groups):
+        found |= errors(model, engine, group, cases)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--engines", nargs="+", choices=ENGINES, default=ENGINES)
+    parser.add_argument("--models", nargs="+", choices=list(MODELS), default=list(MODELS))
+    parser.add_argument("--alone", action="store_true", help="compile each array alone")
+    arguments = parser.parse_args()
+    prepare_jax()
+    worst: dict[tuple[str, str], list[float]] = {}
+    refused: dict[tuple[str, str], list[str]] = {}
+    for name in arguments.models:
+        model = MODELS[name]()
+        for engine in arguments.engines:
+            found = sweep(model, engine, arguments.alone)
+            for array in array_names(model):
+                if array not in found:
+                    refused.setdefault((array, engine), []).append(name)
+                    continue
+                old = worst.get((array, engine), [0.0, 0.0])
+                worst[array, engine] = [max(pair) for pair in zip(old, found[array], strict=True)]
+                if max(found[array]) > TOLERANCE[engine]:
+                    print(f"{name}: {array} on {engine}: {found[array]}", flush=True)
+            print(f"{name} on {engine}: {len(found)} arrays compared", flush=True)
+    _print_table(array_names(model), arguments, worst, refused)
+
+
+def _print_table(names: list[str], arguments: argparse.Namespace, worst: dict, refused: dict) -> None:
+    print("", "array".ljust(20) + "".join(f"{f'{e} {m}':>14}" for e in arguments.engines for m in MOMENTS), sep="\n")
+    for name in names:
+        cells = []
+        for engine in arguments.engines:
+            for error in worst.get((name, engine), [None, None]):
+                equal = "equal" if error is not None and error <= TOLERANCE[engine] else f"{error:.1e}" if error else ""
+                some = "*" if equal and (name, engine) in refused else ""
+                cells.append(f"{equal + some or 'refused':>14}")
+        print(name.ljust(20) + "".join(cells))
+    print("\n* refused for some models:")
+    for (name, engine), of in refused.items():
+        if (name, engine) in worst:
+            print(f"{name} on {engine}: {', '.join(of)}")
+
+
+if __name__ == "__main__":
+    main()
