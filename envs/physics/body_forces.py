@@ -39,7 +39,7 @@ def body_forces(model: mujoco.MjModel, arrays: Derived, qvel: Float[Array, "B nv
 def _body_forces(model: mujoco.MjModel, arrays: Derived, qvel: Float[Array, " nv"]) -> Derived:
     contains = _subtrees(model)
     has_gravity = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
-    world = np.float32([0, 0, 0, *(-model.opt.gravity if has_gravity else np.zeros(3))])
+    world = np.concatenate([np.zeros(3), -model.opt.gravity if has_gravity else np.zeros(3)]).astype(np.float32)
     joint_acceleration = arrays["cdof_dot"] * qvel[:, None] + arrays["cdof"] * arrays["qacc"][:, None]
     cacc = world + contains.T[:, model.dof_bodyid].astype(np.float32) @ joint_acceleration
     momentum = jax.vmap(mjx_math.inert_mul)(arrays["cinert"], arrays["cvel"])
