@@ -115,6 +115,22 @@ SENSORS = {
     "cutoff": '<jointvel joint="knee" cutoff=".1"/>',
 }
 """One sensor of each kind."""
+NOT_ON_MJX = {
+    *("jointlimitpos", "jointlimitvel", "jointlimitfrc", "tendonlimitpos", "tendonlimitvel", "tendonlimitfrc"),
+    *(
+        "distance",
+        "normal",
+        "fromto",
+        "e_potential",
+        "e_kinetic",
+        "insidesite",
+        "user",
+        "clock",
+        "rangefinder",
+        "contact",
+    ),
+}
+"""Kinds that one of the MJX engines does not compute as MuJoCo does."""
 SUBTREE_SENSORS = '<subtreelinvel body="torso"/><subtreeangmom body="shin"/><subtreecom body="torso"/>'
 
 
@@ -145,6 +161,7 @@ MODELS: dict[str, Callable[[], mujoco.MjModel]] = {
     "force_sensors": lambda: rich(sensor=FORCE_SENSORS),
     "force_sensors_rk4": lambda: rich("RK4", sensor=FORCE_SENSORS),
     "no_sensors": lambda: rich(sensor=FORCE_SENSORS, flag='sensor="disable"'),
+    "sensors": lambda: sensors(*(kind for kind in SENSORS if kind not in NOT_ON_MJX)),
     "subtree_sensors": lambda: rich(sensor=SUBTREE_SENSORS),
     "subtree_sensors_rk4": lambda: rich("RK4", sensor=SUBTREE_SENSORS),
 }
@@ -260,7 +277,11 @@ def main() -> None:
     for name in arguments.models:
         model = MODELS[name]()
         for engine in arguments.engines:
-            found = sweep(model, engine, arguments.alone)
+            try:
+                found = sweep(model, engine, arguments.alone)
+            except UserError as error:
+                print(f"{name} on {engine}: {error}", flush=True)
+                continue
             for array in array_names(model):
                 if array not in found:
                     refused.setdefault((array, engine), []).append(name)

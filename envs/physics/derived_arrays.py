@@ -50,7 +50,7 @@ _RNE_SENSORS = (
 )
 _OTHER_SENSORS = {
     "warp": (_Sensor.mjSENS_GEOMDIST, _Sensor.mjSENS_GEOMNORMAL, _Sensor.mjSENS_GEOMFROMTO),
-    "jax": (),
+    "jax": (_Sensor.mjSENS_CONTACT, _Sensor.mjSENS_RANGEFINDER),
 }
 """Sensors that MJX computes otherwise than MuJoCo."""
 
