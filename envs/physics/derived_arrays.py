@@ -111,7 +111,7 @@ def _unknown(model: mujoco.MjModel, name: str) -> str:
     if name in dir(mujoco.MjData):
         return f"no engine returns mjData's '{name}'; it is no array of fixed size that describes the simulated state"
     near = near_misses(name, sorted(_EVERY | _NOT_JAX | _ONLY_C))
-    return f"MuJoCo's mjData has no array '{name}'" + (f"; did you mean: {', '.join(near)}?" if near else "")
+    return f"MuJoCo's mjData has no array '{name}'" + (f" (did you mean: {', '.join(near)}?)" if near else "")
 
 
 def _sensors(model: mujoco.MjModel, kinds: tuple[mujoco.mjtSensor, ...]) -> Iterator[str]:

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from derived_arrays import MODELS, TOLERANCE, accepted, array_names, errors, reference_cases, sensors
+from derived_arrays import MODELS, TOLERANCE, accepted, array_names, errors, reference_cases
 from mujoco.mjx._src import smooth as mjx_smooth
+from rich_model import sensors
 
 from mjx_walk.envs.physics import ENGINES, PhysicsState, make_engine
 from mjx_walk.utils.errors import UserError
@@ -90,7 +91,7 @@ def test_an_array_is_accepted_or_refused_in_one_line(engine):
         ("c", "floor", "efc_force", "no engine returns mjData's 'efc_force'"),
         ("c", "floor", "contact", "no engine returns mjData's 'contact'"),
         ("c", "floor", "time", "mjData's 'time' depends on earlier steps"),
-        ("c", "floor", "xpo", "mjData has no array 'xpo'; did you mean: xpos"),
+        ("c", "floor", "xpo", "mjData has no array 'xpo' (did you mean: xpos"),
         ("jax", "floor", "qLD", "physics=jax does not return mjData's 'qLD' as MuJoCo does; use physics=c"),
         ("jax", "floor", "ten_J", "physics=jax does not return mjData's 'ten_J' as MuJoCo does; use physics=warp or c"),
         ("warp", "floor", "energy", "physics=warp does not return mjData's 'energy' as MuJoCo does; use physics=c"),
