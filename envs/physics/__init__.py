@@ -10,6 +10,7 @@ import warnings
 import mujoco
 
 from mjx_walk.envs.physics.base import Derived, Engine, PhysicsState
+from mjx_walk.envs.physics.derived_arrays import refuse_derived
 from mjx_walk.envs.physics.preparation import nothing_runs
 from mjx_walk.envs.physics.supported import refuse_unsupported, unsupported_by_mjx, warn_of_approximations
 from mjx_walk.utils.devices import default_backend, default_device
@@ -69,7 +70,7 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
         derived: names of the `mjData` arrays that the task reads.
 
     Raises:
-        UserError: the engine does not simulate something that the model has.
+        UserError: the engine does not simulate something that the model has, or does not return a derived array.
     """
     integrator = mujoco.mjtIntegrator(model.opt.integrator)
     if integrator not in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4):
@@ -78,6 +79,7 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
             f"the model's integrator '{given}' is not supported; set integrator to Euler or RK4 in <option>"
         )
     refuse_unsupported(model, name)
+    refuse_derived(model, name, derived)
     if name == "c":
         from mjx_walk.envs.physics.mujoco_c import CEngine
 

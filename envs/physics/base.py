@@ -6,14 +6,12 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from jax import Array
 from jax.custom_batching import custom_vmap
 from jaxtyping import Bool, Float
 
 from mjx_walk.envs.physics.preparation import Preparation
 from mjx_walk.utils.compat import standard_dtypes
-from mjx_walk.utils.errors import UserError
 
 Derived = dict[str, Array]
 """MuJoCo arrays by their `mjData` names, for example `cinert`, `[nbody, 10] f32`."""
@@ -30,19 +28,6 @@ class PhysicsState(NamedTuple):
     """`[nv] f32`, m/s² and rad/s²."""
 
 
-def derived_shapes(model: mujoco.MjModel, names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    """Shapes of derived arrays, which are the same on every engine.
-
-    Raises:
-        UserError: `mjData` has no such array.
-    """
-    blank = mujoco.MjData(model)
-    for name in names:
-        if not isinstance(getattr(blank, name, None), np.ndarray):
-            raise UserError(f"MuJoCo's mjData has no array '{name}', which the task names in derived_names")
-    return {name: np.shape(getattr(blank, name)) for name in names}
-
-
 class Engine(Protocol):
     """A physics engine for one model, one number of substeps and one list of derived arrays.
 
@@ -56,7 +41,10 @@ class Engine(Protocol):
     """What must end before its programs run."""
 
     def forward(self, state: PhysicsState) -> Derived:
-        """Derived arrays of a new state at zero control. Source: Gymnasium's `set_state` (`mj_forward`)."""
+        """Derived arrays of a new state at zero control. Source: Gymnasium's `set_state` (`mj_forward`).
+
+        `LATE_ARRAYS` are zeros, unless a sensor needs them.
+        """
         ...
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> tuple[PhysicsState, Derived, Bool[Array, ""]]:
@@ -69,7 +57,7 @@ class Engine(Protocol):
         Returns:
             The next state; the derived arrays of the last forward pass, which precede the last integration: with Euler
             those at the start of the last substep, with RK4 those of its fourth stage; and whether a contact or
-            constraint buffer overflowed.
+            constraint buffer overflowed. `LATE_ARRAYS` are those of `mj_rnePostConstraint` after the integration.
         """
         ...
 

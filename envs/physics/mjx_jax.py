@@ -12,12 +12,12 @@ from mujoco import mjx
 from mujoco.mjx._src import forward as mjx_forward
 from mujoco.mjx._src import scan as mjx_scan
 from mujoco.mjx._src import smooth as mjx_smooth
-from mujoco.mjx._src import types as mjx_types
 
 from mjx_walk.envs.physics import capsule_frames_jax, static_pairs
 from mjx_walk.envs.physics.base import Derived, PhysicsState
+from mjx_walk.envs.physics.derived_arrays import LATE_ARRAYS, derived_shapes
 from mjx_walk.envs.physics.jax_model import adapt_model
-from mjx_walk.envs.physics.mjx_model import check_derived, read_derived, with_newton_solver
+from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
 from mjx_walk.envs.physics.preparation import Preparation
 
 _RK4_STEP = (0.0, 0.5, 0.5, 1.0)
@@ -40,7 +40,7 @@ class JaxEngine:
         self._substep = _runge_kutta_4 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else _euler
         self._num_substeps = num_substeps
         self.preparation = Preparation()
-        self._derived = check_derived(model, derived, mjx_types.DataJAX)
+        self._derived = derived_shapes(model, derived)
 
     def change_model(self, changes: dict[str, Array]) -> None:
         """Step a changed model from now on, for domain randomization. A program compiled before keeps its model.
@@ -57,16 +57,17 @@ class JaxEngine:
         return self._blank.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
 
     def forward(self, state: PhysicsState) -> Derived:
-        """See `Engine.forward`. As after `mj_forward`, `cfrc_ext` is zero."""
+        """See `Engine.forward`."""
         with jax.default_matmul_precision("highest"):
-            return read_derived(mjx.forward(self._model, self._data(state)), self._derived)
+            data = mjx.forward(self._model, self._data(state))
+        return read_derived(data.replace(qpos=state.qpos), self._derived)  # MJX normalizes its quaternions
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> tuple[PhysicsState, Derived, Bool[Array, ""]]:
         """See `Engine.step`. No buffer overflows: MJX allocates every possible contact."""
         with jax.default_matmul_precision("highest"):
             data = self._data(state).replace(ctrl=ctrl)
             data, _ = jax.lax.scan(lambda d, _: (self._substep(self._model, d), None), data, length=self._num_substeps)
-            if "cfrc_ext" in self._derived:
+            if self._derived.keys() & LATE_ARRAYS:
                 data = mjx_smooth.rne_postconstraint(self._model, data)
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
         return state, read_derived(data, self._derived), jnp.zeros((), bool)

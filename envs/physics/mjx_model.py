@@ -1,13 +1,12 @@
 """Functions of both MJX engines: preparing the model and reading derived arrays."""
 
 import copy
-import dataclasses
 
+import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from mjx_walk.envs.physics.base import Derived, derived_shapes
-from mjx_walk.utils.errors import UserError
+from mjx_walk.envs.physics.base import Derived
 
 MIN_SOLVER_ITERATIONS = 8
 """Newton iterations and line-search steps. In float32, 8 give the same result as 50; 4 do only with few contacts."""
@@ -33,34 +32,13 @@ def with_newton_solver(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def check_derived(model: mujoco.MjModel, names: tuple[str, ...], private: type) -> dict[str, tuple[int, ...]]:
-    """Shapes of derived arrays that MJX computes.
-
-    Args:
-        model: the model.
-        names: of the arrays.
-        private: class of MJX's implementation-specific data.
-
-    Raises:
-        UserError: MuJoCo has no such array, or MJX does not compute it.
-    """
-    shapes = derived_shapes(model, names)
-    known = {field.name for kind in (mjx.Data, private) for field in dataclasses.fields(kind)}
-    for name in names:
-        if name not in known:
-            raise UserError(f"MJX does not compute '{name}', which the task names in derived_names; use physics=c")
-    if "sensordata" in names and model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        raise UserError('MJX computes sensors at another stage of RK4 than MuJoCo; use integrator="Euler" or physics=c')
-    return shapes
-
-
 def read_derived(data: mjx.Data, shapes: dict[str, tuple[int, ...]], batch: tuple[int, ...] = ()) -> Derived:
-    """Derived arrays by name, in MuJoCo's shapes. MJX stores some of them in `_impl`, its implementation-specific data.
+    """Derived arrays by name, in MuJoCo's shapes and float32. MJX stores some of them in `_impl`.
 
     Args:
         data: MJX's data.
-        shapes: of `check_derived`.
+        shapes: of `derived_shapes`.
         batch: shape of the batch.
     """
     found = {name: getattr(data, name) if hasattr(data, name) else getattr(data._impl, name) for name in shapes}
-    return {name: array.reshape(batch + shapes[name]) for name, array in found.items()}
+    return {name: array.reshape(batch + shapes[name]).astype(jnp.float32) for name, array in found.items()}

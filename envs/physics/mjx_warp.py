@@ -12,11 +12,11 @@ import warp as wp
 from jax import Array
 from jaxtyping import Bool, Float
 from mujoco import mjx
-from mujoco.mjx.warp.types import DataWarp
 
-from mjx_walk.envs.physics import capsule_frames_warp
+from mjx_walk.envs.physics import body_forces, capsule_frames_warp
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
-from mjx_walk.envs.physics.mjx_model import check_derived, read_derived, with_newton_solver
+from mjx_walk.envs.physics.derived_arrays import LATE_ARRAYS, derived_shapes, fills_late_arrays
+from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
 from mjx_walk.envs.physics.preparation import Preparation
 from mjx_walk.envs.physics.static_pairs import drop_static_pairs
 from mjx_walk.envs.physics.warp_kernels import choose_cache, load_kernels
@@ -54,7 +54,9 @@ class WarpEngine:
         self._model = mjx.put_model(self._mj_model, impl="warp", device=default_device()).tree_replace(
             {"opt._impl.warn_overflow": 0}
         )
-        last_model = self._model.tree_replace({"opt._impl.run_rne_postconstraint": "cfrc_ext" in derived})
+        last_model = self._model.tree_replace(
+            {"opt._impl.run_rne_postconstraint": any(x in LATE_ARRAYS for x in derived)}
+        )
         self._mjx_forward = _over_batch(mjx.forward, self._model)
         self._mjx_step = _over_batch(mjx.step, self._model)
         self._last_mjx_step = _over_batch(mjx.step, last_model)
@@ -62,7 +64,8 @@ class WarpEngine:
         # Equality constraints and frictional joints have a row each in every step, unlike contacts and limits.
         with_friction = np.count_nonzero(model.dof_frictionloss) + np.count_nonzero(model.tendon_frictionloss)
         self._njmax = CONSTRAINTS_PER_ENV + model.neq + int(with_friction)
-        self._derived = check_derived(model, derived, DataWarp)
+        self._derived = derived_shapes(model, derived)
+        self._body_forces = [name for name in body_forces.OUTPUTS if name in derived]
         self.preparation = Preparation(self._load_kernels)
         self.forward = batch_once(self._forward)
         self.step = batch_once(self._step)
@@ -90,7 +93,12 @@ class WarpEngine:
         return jax.vmap(lambda s: blank.replace(qpos=s.qpos, qvel=s.qvel, qacc_warmstart=s.qacc_warmstart))(state)
 
     def _forward(self, state: PhysicsState) -> Derived:
-        return read_derived(self._mjx_forward(self._data(state)), self._derived, state.qpos.shape[:1])
+        data = self._mjx_forward(self._data(state)).replace(qpos=state.qpos)  # MJX normalizes its quaternions
+        derived = read_derived(data, self._derived, state.qpos.shape[:1])
+        if fills_late_arrays(self._mj_model):
+            return derived
+        # Warp uses these for the bias forces.
+        return derived | {name: jnp.zeros_like(derived[name]) for name in self._body_forces}
 
     def _step(self, state: PhysicsState, ctrl: Float[Array, "B nu"]) -> tuple[PhysicsState, Derived, Bool[Array, " B"]]:
         data = self._data(state).replace(ctrl=ctrl)
@@ -106,7 +114,15 @@ class WarpEngine:
         # Velocities diverge once constraint rows are lost, so the task must end these episodes as not finite.
         qpos = jnp.where(lost_rows[:, None], jnp.nan, data.qpos)
         state = PhysicsState(qpos, data.qvel, data.qacc_warmstart)
-        return state, read_derived(data, self._derived, ctrl.shape[:1]), overflow | lost_rows
+        return state, self._read_after_step(data), overflow | lost_rows
+
+    def _read_after_step(self, data: mjx.Data) -> Derived:
+        derived = read_derived(data, self._derived, data.qvel.shape[:1])
+        if not self._body_forces:
+            return derived
+        shapes = derived_shapes(self._mj_model, body_forces.INPUTS)
+        forces = body_forces.body_forces(self._mj_model, read_derived(data, shapes, data.qvel.shape[:1]), data.qvel)
+        return derived | {name: forces[name] for name in self._body_forces}
 
 
 def warp_device(device: jax.Device) -> wp.Device:

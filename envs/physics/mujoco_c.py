@@ -14,7 +14,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once, derived_shapes
+from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
+from mjx_walk.envs.physics.derived_arrays import derived_shapes
 from mjx_walk.envs.physics.preparation import Preparation
 
 _WARNING = mujoco.mjtWarning
