@@ -41,19 +41,30 @@ def test_bench_measures_and_writes(tmp_path):
 
 
 @pytest.mark.slow
-def test_bench_measures_how_training_scales(tmp_path):
-    arguments = ("algo=td3", *TINY_OFF_POLICY, "num_envs=32", "seconds=0.5", f"out={tmp_path}/bench.json")
-    done = command("bench", *arguments, "devices=2")
-    assert done.returncode == 0, done.stderr
-    results = json.loads((tmp_path / "bench.json").read_text())["results"]
-    alone, each, in_all = (results[f"training, {name} environments"] for name in ("1 x 32", "2 x 32", "2 x 16"))
-    assert alone > 10
-    assert results["  2 x 32 environments: times one device"] == each / alone
-    assert results["  2 x 16 environments: times one device"] == in_all / alone
+def test_bench_measures_how_training_scales(monkeypatch):
+    """Speeds that are given, and what each device does in trainings of one and of two processes."""
+    given = {("num_envs=32", 1): 100.0, ("num_envs=32", 2): 180.0, ("num_envs=16", 2): 120.0}
+
+    def speed(arguments, size, seconds):
+        num_envs = [argument for argument in arguments if argument.startswith("num_envs=")][-1]
+        return scaling.Speed(given[num_envs, size], 0.5)
+
+    monkeypatch.setattr(scaling, "measure_speed", speed)
+    settings = ["algo=td3", *TINY_OFF_POLICY, "num_envs=32"]
+    results = {name: value for name, value, _ in scaling.measure(settings, load_config(settings), [1, 2], 0.5)}
+    assert [results[f"training, {name} environments"] for name in ("1 x 32", "2 x 32", "2 x 16")] == [100, 180, 120]
+    assert results["  2 x 32 environments: times one device"] == 1.8
+    assert results["  2 x 16 environments: times one device"] == 1.2
     assert results["  1 x 32 environments: reductions in a recorded call"] == 0
     assert results["  2 x 16 environments: reductions in a recorded call"] > 0
     assert results["  2 x 16 environments: share of reductions"] > 0
     assert results["data to reduce in an iteration, per device"] > 0
+
+
+@pytest.mark.slow
+def test_the_speed_of_a_training_is_measured():
+    speed = scaling.measure_speed(["algo=td3", *TINY_OFF_POLICY, "num_envs=32"], 1, 0.5)
+    assert speed.steps_per_second > 10 and speed.call_seconds > 0
 
 
 def test_a_mistake_in_the_settings_costs_one_line(capsys):
