@@ -19,16 +19,17 @@ SHORTER = {
 
 
 @pytest.mark.parametrize(
-    ("env", "algo", "least"), [("inverted_pendulum", "ppo", 950), ("walker2d", "td3", 400), ("walker2d", "a2c", 800)]
+    ("env", "algo", "least", "enough"),
+    [("inverted_pendulum", "ppo", 950, 999), ("walker2d", "td3", 400, 600), ("walker2d", "a2c", 800, 920)],
 )
-def test_a_policy_is_good_after_the_cpu_recipe(tmp_path, env, algo, least):
-    """The command that a user without a GPU types, stopped by SIGTERM when an evaluation is above the mark.
+def test_a_policy_is_good_after_the_cpu_recipe(tmp_path, env, algo, least, enough):
+    """The command that a user without a GPU types, stopped by SIGTERM once an evaluation is clearly above the mark.
 
     After one call, a walker scores about 300 in Gymnasium.
     """
     arguments = (f"env={env}", f"algo={algo}", *SHORTER[algo], "evaluation.gymnasium_episodes=0")
     process = start("train", *arguments, f"run_dir={tmp_path}/run", seconds=2400, env=AS_A_USER)
-    wait_for_row(process, tmp_path / "run", lambda row: row.get("eval/return", 0.0) >= 1.05 * least)
+    wait_for_row(process, tmp_path / "run", lambda row: row.get("eval/return", 0.0) >= enough)
     process.send_signal(signal.SIGTERM)
     finish(process)
     done = command("eval", f"run={tmp_path}/run", "policy=best", env=AS_A_USER)
