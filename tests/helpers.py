@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
+from shared_programs import shared_programs
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
@@ -194,7 +195,7 @@ def saved_leaves(path):
 
 def train_here(run_dir, *arguments, tiny=TINY):
     """Train in this process. Curves are not drawn, which would take a quarter of the time."""
-    with pytest.MonkeyPatch.context() as patched:
+    with pytest.MonkeyPatch.context() as patched, shared_programs():
         patched.setattr("mjx_walk.viewing.run_plots.plot_run", lambda folder: None)
         assert command_here("train", *tiny, f"run_dir={run_dir}", *arguments) == 0
 

@@ -23,6 +23,7 @@ from helpers import (
     fake_run,
     unregistered,
 )
+from shared_programs import shared_programs
 
 import mjx_walk
 from mjx_walk import zoo
@@ -237,5 +238,5 @@ def test_every_command(line, small_run, tmp_path, monkeypatch, capfd):
         done = command(name, *arguments, timeout=900)
         assert done.returncode == 0, f"{name} {shlex.join(arguments)}\n{done.stdout}\n{done.stderr}"
         return
-    with unregistered():
+    with unregistered(), shared_programs():
         assert command_here(name, *arguments) == 0, f"{name} {shlex.join(arguments)}\n{capfd.readouterr()}"
