@@ -10,11 +10,13 @@ import subprocess
 import sys
 import threading
 import zlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
+from shared_programs import shared_programs
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
@@ -101,17 +103,17 @@ def command(module: str, *arguments: str, **kwargs) -> subprocess.CompletedProce
     )
 
 
-def start(module: str, *arguments: str, **kwargs) -> subprocess.Popen:
-    """`command`, left running. Its output and its errors are one stream. It is killed after five minutes."""
+def start(module: str, *arguments: str, seconds=300, env=None, **kwargs) -> subprocess.Popen:
+    """`command`, left running. Its output and its errors are one stream. It is killed after so many seconds."""
     process = subprocess.Popen(
         [sys.executable, "-m", f"mjx_walk.{module}", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        env=ENVIRONMENT,
+        env=ENVIRONMENT | (env or {}),
         **kwargs,
     )
-    limit = threading.Timer(300, process.kill)
+    limit = threading.Timer(seconds, process.kill)
     limit.daemon = True
     limit.start()
     return process
@@ -129,11 +131,24 @@ def wait_for_line(process: subprocess.Popen, text: str) -> None:
 
 def wait_for_rows(process: subprocess.Popen, run_dir: Path, count: int) -> None:
     """Block until a started command has logged that many calls to a run folder that it creates."""
+    with following(process, run_dir) as lines:
+        rows = [next(lines, "") for _ in range(count)]
+    assert all(rows), finish(process)
+
+
+def wait_for_row(process: subprocess.Popen, run_dir: Path, is_it: Callable[[dict], bool]) -> None:
+    """Block until a started command has logged a row of that kind, or has ended."""
+    with following(process, run_dir) as lines:
+        any(is_it(json.loads(line)) for line in lines)
+
+
+@contextlib.contextmanager
+def following(process: subprocess.Popen, run_dir: Path) -> Iterator[Iterator[str]]:
+    """The lines of a run's `metrics.jsonl`, as they are written, until the process ends."""
     follow = ["tail", f"--pid={process.pid}", "--lines=+1", "--follow=name", "--retry", str(run_dir / "metrics.jsonl")]
     with subprocess.Popen(follow, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as tail:
-        rows = [tail.stdout.readline() for _ in range(count)]
+        yield iter(tail.stdout)
         tail.kill()
-    assert all(rows), finish(process)
 
 
 def finish(process: subprocess.Popen) -> str:
@@ -180,7 +195,7 @@ def saved_leaves(path):
 
 def train_here(run_dir, *arguments, tiny=TINY):
     """Train in this process. Curves are not drawn, which would take a quarter of the time."""
-    with pytest.MonkeyPatch.context() as patched:
+    with pytest.MonkeyPatch.context() as patched, shared_programs():
         patched.setattr("mjx_walk.viewing.run_plots.plot_run", lambda folder: None)
         assert command_here("train", *tiny, f"run_dir={run_dir}", *arguments) == 0
 

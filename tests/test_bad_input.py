@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from helpers import TINY, TINY_CALL, command, command_here, edit_config
+from helpers import TINY, TINY_CALL, command, command_here, edit_config, train_here
 
 from mjx_walk import api
 from mjx_walk import bench as bench_command
@@ -193,7 +193,7 @@ def test_a_folder_that_is_not_ours_is_left_alone(tmp_path):
 def finished(tmp_path_factory):
     """A tiny run."""
     path = tmp_path_factory.mktemp("runs") / "run"
-    train_command.main([*TINY, f"run_dir={path}", f"total_steps={2 * TINY_CALL}"])
+    train_here(path, f"total_steps={2 * TINY_CALL}")
     return path
 
 

@@ -40,20 +40,34 @@ def test_bench_measures_and_writes(tmp_path):
     assert content["env"] == "Walker2d-v5" and content["versions"]["mujoco"] and "32 environments" in content["device"]
 
 
-@pytest.mark.slow
-def test_bench_measures_how_training_scales(tmp_path):
-    arguments = ("algo=td3", *TINY_OFF_POLICY, "num_envs=32", "seconds=0.5", f"out={tmp_path}/bench.json")
-    done = command("bench", *arguments, "devices=2")
-    assert done.returncode == 0, done.stderr
-    results = json.loads((tmp_path / "bench.json").read_text())["results"]
-    alone, each, in_all = (results[f"training, {name} environments"] for name in ("1 x 32", "2 x 32", "2 x 16"))
-    assert alone > 10
-    assert results["  2 x 32 environments: times one device"] == each / alone
-    assert results["  2 x 16 environments: times one device"] == in_all / alone
-    assert results["  1 x 32 environments: reductions in a recorded call"] == 0
-    assert results["  2 x 16 environments: reductions in a recorded call"] > 0
-    assert results["  2 x 16 environments: share of reductions"] > 0
+SCALED = ["algo=td3", *TINY_OFF_POLICY, "num_envs=32", "iterations_per_call=1"]
+
+
+def test_speeds_are_compared_with_one_device_s(monkeypatch):
+    given = {("num_envs=32", 1): 100.0, ("num_envs=32", 2): 180.0, ("num_envs=16", 2): 120.0}
+
+    def measure_speed(arguments, size, seconds):
+        num_envs = [argument for argument in arguments if argument.startswith("num_envs=")][-1]
+        return scaling.Speed(given[num_envs, size], 0.5)
+
+    monkeypatch.setattr(scaling, "measure_speed", measure_speed)
+    monkeypatch.setattr(scaling, "_parts", lambda *_: iter(()))
+    results = {name: value for name, value, _ in scaling.measure(SCALED, load_config(SCALED), [1, 2], 0.5)}
+    assert [results[f"training, {name} environments"] for name in ("1 x 32", "2 x 32", "2 x 16")] == [100, 180, 120]
+    assert results["  2 x 32 environments: times one device"] == 1.8
+    assert results["  2 x 16 environments: times one device"] == 1.2
     assert results["data to reduce in an iteration, per device"] > 0
+
+
+@pytest.mark.slow
+def test_what_a_device_does_in_a_call_is_recorded():
+    """In a training in one process, and in one in two, of which the first one records."""
+    shared = [*SCALED, *share_of_total(load_config(SCALED), 2)]
+    parts = [*scaling._parts("1 x 32", SCALED, 1), *scaling._parts("2 x 16", shared, 2)]
+    results = {name: value for name, value, _ in parts}
+    assert results["  1 x 32: reductions in a recorded call"] == 0
+    assert results["  2 x 16: reductions in a recorded call"] > 0
+    assert results["  2 x 16: share of reductions"] > 0
 
 
 def test_a_mistake_in_the_settings_costs_one_line(capsys):

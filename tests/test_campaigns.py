@@ -1,9 +1,10 @@
 """Campaigns of minutes, run by CI after the fast tests."""
 
 import json
+import signal
 
 import pytest
-from helpers import command
+from helpers import command, finish, start, wait_for_row
 
 pytestmark = pytest.mark.slow
 
@@ -18,23 +19,24 @@ SHORTER = {
 
 
 @pytest.mark.parametrize(
-    ("env", "algo", "least"), [("inverted_pendulum", "ppo", 950), ("walker2d", "td3", 400), ("walker2d", "a2c", 800)]
+    ("env", "algo", "least", "enough"),
+    [("inverted_pendulum", "ppo", 950, 999), ("walker2d", "td3", 400, 600), ("walker2d", "a2c", 800, 920)],
 )
-def test_a_policy_is_good_after_the_cpu_recipe(tmp_path, env, algo, least):
-    """The command that a user without a GPU types. After one call, a walker scores about 300 in Gymnasium."""
-    arguments = (f"env={env}", f"algo={algo}", *SHORTER[algo], f"run_dir={tmp_path}/run")
-    done = command("train", *arguments, timeout=2400, env=AS_A_USER)
+def test_a_policy_is_good_after_the_cpu_recipe(tmp_path, env, algo, least, enough):
+    """The command that a user without a GPU types, stopped by SIGTERM once an evaluation is clearly above the mark.
+
+    After one call, a walker scores about 300 in Gymnasium.
+    """
+    arguments = (f"env={env}", f"algo={algo}", *SHORTER[algo], "evaluation.gymnasium_episodes=0")
+    process = start("train", *arguments, f"run_dir={tmp_path}/run", seconds=2400, env=AS_A_USER)
+    wait_for_row(process, tmp_path / "run", lambda row: row.get("eval/return", 0.0) >= enough)
+    process.send_signal(signal.SIGTERM)
+    printed = finish(process)
+    assert process.returncode in (0, 128 + signal.SIGTERM), printed
+    done = command("eval", f"run={tmp_path}/run", "policy=best", env=AS_A_USER)
     assert done.returncode == 0, done.stderr
     best = json.loads((tmp_path / "run" / "eval_gymnasium.json").read_text())["best"]
     assert best["mean"] >= least and len(best["returns"]) == 100
-
-
-def test_parity_where_new_memory_holds_no_zeros():
-    """On a CPU, reductions over a batch of this size read memory that was never written, without `prepare_jax`."""
-    sizes = ("env=humanoid_standup", "num_envs=48", "steps=120")
-    done = command("parity", "physics=jax", *sizes, env=AS_A_USER | {"MALLOC_PERTURB_": "128"})
-    assert done.returncode == 0, done.stdout
-    assert "0 not finite" in done.stdout
 
 
 OWN = {
@@ -43,7 +45,7 @@ OWN = {
 }
 
 
-@pytest.mark.parametrize(("algo", "physics"), [("ppo", "jax"), ("ppo", "warp"), ("sac", "warp")])
+@pytest.mark.parametrize(("algo", "physics"), [("ppo", "jax"), ("sac", "warp")])
 def test_humanoid_trains_through_mjx(tmp_path, algo, physics):
     """A small batch, from the command to the score, on each MJX engine."""
     small = ("num_envs=16", "evaluation.num_envs=2", "total_steps=1024", "algo.unroll_length=16")

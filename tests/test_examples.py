@@ -46,6 +46,7 @@ def train_robot(tmp_path, *arguments):
 
 
 @needs_dm_control
+@pytest.mark.dm_control
 @renders
 def test_own_robot_trains_and_plays(tmp_path, capsys):
     run = train_robot(tmp_path)

@@ -50,8 +50,8 @@ def test_kills(server, tmp_path, rng, num_faults, name):
 
 
 @pytest.mark.slow
-def test_ten_kills(server, tmp_path, rng):
-    kill_again_and_again(server, "ppo", tmp_path, rng, 10)
+def test_five_kills(server, tmp_path, rng):
+    kill_again_and_again(server, "ppo", tmp_path, rng, 5)
 
 
 @pytest.mark.campaign

@@ -89,7 +89,7 @@ def test_it_runs_on_a_cpu(tmp_path):
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     (parameters,) = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
     parameters.source += (
-        "\nSTEPS = 80_000\nOPTIONS = [*OPTIONS[:2], f'total_steps={STEPS}', 'evaluation.gymnasium_episodes=2']"
+        "\nSTEPS = 40_000\nOPTIONS = [*OPTIONS[:2], f'total_steps={STEPS}', 'evaluation.gymnasium_episodes=2']"
     )
     NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path)}}).execute()
     texts = {kind: [] for kind in ("stream", "display_data", "execute_result")}

@@ -11,13 +11,27 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
-from helpers import CLONE, ENVIRONMENT, PAGES, TINY, TINY_OFF_POLICY, blocks, command, command_here, unregistered
+from helpers import (
+    CLONE,
+    ENVIRONMENT,
+    PAGES,
+    TINY,
+    TINY_OFF_POLICY,
+    blocks,
+    command,
+    command_here,
+    fake_run,
+    unregistered,
+)
+from shared_programs import shared_programs
 
 import mjx_walk
 from mjx_walk import zoo
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.envs import make_env
+from mjx_walk.experiments import planned_runs
 from mjx_walk.runs.config import load_config
+from mjx_walk.training.trainer import Trainer
 
 RESULTS = (CLONE / "docs" / "results.md").read_text()
 CHANGE_A_TASK = (CLONE / "docs" / "change_a_task.md").read_text()
@@ -157,8 +171,27 @@ def sizes(arguments):
     return [setting for setting in tiny if setting.split("=")[0] in have - given]
 
 
-OWN_PROCESS = (r"train -m ", r"train .*(devices|seeds)=", r"play ", r"compare env=")
+OWN_PROCESS = r"train .*devices="
 """Commands that run in a process of their own. The tests' process, which runs the others, has the imports already."""
+
+TRAINED_ELSEWHERE = {
+    r"train env=humanoid algo=\w+$": "runs/test_old_runs.py",
+    r"train .*\bseeds=": "training/test_seeds.py",
+    r"train -m ": "test_train.py",
+}
+"""Commands with the test that trains so to the end. Here, they end when JAX has traced their programs."""
+
+
+def only_trace(trainer):
+    """What takes the place of `Trainer.train`."""
+    trainer._program.lower(trainer._keys, None)
+
+
+def finish_at_once(job, *_):
+    """What takes the place of `planned_runs.start_job`; `experiments/test_comparison.py` trains."""
+    for run in job:
+        fake_run(run.folder.path, [*run.overrides, f"seed={run.config.seed}"], [1.0, 2.0], score=3.0)
+    return subprocess.Popen(["true"])
 
 
 def smaller(line):
@@ -194,10 +227,16 @@ def test_every_command(line, small_run, tmp_path, monkeypatch, capfd):
         arguments += ["width=96", "height=64"]
     elif name == "compare":
         arguments = [argument for argument in arguments if not argument.startswith(("seeds=", "total_steps="))]
-        arguments += ["seeds=1", "total_steps=1", "evaluation.gymnasium_episodes=1"]
-    if any(re.match(pattern, line) for pattern in OWN_PROCESS):
+        arguments += ["seeds=1", "total_steps=1"]
+        monkeypatch.setattr(planned_runs, "start_job", finish_at_once)
+    if any(re.match(pattern, line) for pattern in TRAINED_ELSEWHERE):
+        monkeypatch.setattr(Trainer, "train", only_trace)
+        monkeypatch.setattr(Trainer, "score", lambda trainer: None)
+    if name == "train":
+        monkeypatch.setattr("mjx_walk.viewing.run_plots.plot_run", lambda folder: None)
+    if re.match(OWN_PROCESS, line):
         done = command(name, *arguments, timeout=900)
         assert done.returncode == 0, f"{name} {shlex.join(arguments)}\n{done.stdout}\n{done.stderr}"
         return
-    with unregistered():
+    with unregistered(), shared_programs():
         assert command_here(name, *arguments) == 0, f"{name} {shlex.join(arguments)}\n{capfd.readouterr()}"

@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 from helpers import TINY, TINY_CALL, command_here
+from shared_programs import shared_programs
 from tensorboardX.proto.event_pb2 import Event
 
 import mjx_walk
@@ -19,6 +20,12 @@ from mjx_walk.envs import make_env
 from mjx_walk.training import trainer
 from mjx_walk.utils import settings
 from mjx_walk.utils.errors import UserError
+
+
+@pytest.fixture(autouse=True)
+def _programs_are_shared():
+    with shared_programs():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -52,7 +52,7 @@ NOT_TRACED = {
     **{(algo, "name"): "it selects the algorithm" for algo in ALGORITHMS},
     ("reinforce", "max_value_grad_norm"): "it adds an optimizer without parameters, which old checkpoints may hold",
 }
-ALL_SETTINGS_FAST = ("ppo", "a2c", "sac", "td3")
+ALL_SETTINGS_FAST = ("ppo", "a2c", "sac")
 """They cover every base class. For the other algorithms, inherited settings are slow tests."""
 
 

@@ -1,11 +1,13 @@
 """The MJX engines against MuJoCo's C library, one step at a time; the tolerances are `mjx_walk.evaluation.parity`'s."""
 
+import ctypes
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from helpers import OPTIMIZED, slow_except
+from helpers import OPTIMIZED, command_here, slow_except
 
 from mjx_walk import parity as parity_command
 from mjx_walk.envs import TASKS, make_env
@@ -16,6 +18,19 @@ from mjx_walk.utils.compat import prepare_jax
 from mjx_walk.utils.errors import UserError
 
 prepare_jax()  # before any test of this process starts JAX
+
+_M_PERTURB = -6
+"""What `mallopt` calls `MALLOC_PERTURB_`."""
+
+
+@pytest.fixture(autouse=True)
+def _new_memory_holds_no_zeros():
+    """On a CPU, without `prepare_jax`, reductions over large batches read memory that was never written."""
+    libc = ctypes.CDLL(None)
+    libc.mallopt(_M_PERTURB, 128)
+    yield
+    libc.mallopt(_M_PERTURB, 0)
+
 
 FAST = [("humanoid", "v5", "warp"), ("half_cheetah", "v5", "jax")]
 """Both engines, both integrators."""
@@ -32,7 +47,7 @@ def test_one_step_from_standing_airborne_thrown_and_fallen_states(name, version,
     stepped = jax.jit(jax.vmap(task.step), compiler_options=OPTIMIZED)(states, actions)
     found = parity.compare(task, parity.one_step(reference, states, actions), jax.device_get(stepped))
     assert found.is_within, "\n".join(map(str, found.errors))
-    assert found.num_steps >= 1600
+    assert found.num_steps >= 1600 and found.nonfinite == 0
     if task.terminates_on_fall:  # both sides of the healthy range were visited
         assert 100 < found.num_terminations < found.num_steps - 100
 
@@ -106,6 +121,14 @@ def test_a_wrong_engine_is_noticed():
     expected = parity.one_step(reference, states, actions)
     assert parity.compare(reference, expected, parity.one_step(reference, states, actions)).is_within
     assert not parity.compare(reference, expected, parity.one_step(wrong, states, actions)).is_within
+
+
+@pytest.mark.slow
+def test_the_command_prints_a_table(capsys):
+    assert command_here("parity", "physics=jax", "env=inverted_pendulum", "num_envs=6", "steps=20") == 0
+    printed = capsys.readouterr()
+    assert "inverted_pendulum v5, jax on cpu: 120 steps\n  qpos " in printed.out
+    assert " 0 mismatches; 0 overflows, 0 not finite\n" in printed.out and printed.err == "within tolerance\n"
 
 
 def test_copies_is_read_as_num_envs_with_one_warning():

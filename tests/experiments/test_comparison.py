@@ -233,13 +233,13 @@ def test_a_run_that_fails_is_named(tmp_path, monkeypatch, capfd):
 
 
 @pytest.mark.slow
-def test_runs_spread_by_hydras_joblib_launcher_are_drawn(tmp_path):
+def test_runs_spread_by_hydras_joblib_launcher_are_drawn(tmp_path, monkeypatch, capfd):
     arguments = ["seed=0,1", "hydra/launcher=joblib", "hydra.sweep.dir=out", *SMALL]
     done = command("train", "-m", *arguments, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    drawn = command("compare", "draw=true", "out=out", cwd=tmp_path)
-    assert drawn.returncode == 0, drawn.stderr
-    assert re.search(r"\| ppo \| final \|.*\| 2 \| 2 \| 0\.00 \|", drawn.stdout)
+    monkeypatch.chdir(tmp_path)
+    assert command_here("compare", "draw=true", "out=out") == 0
+    assert re.search(r"\| ppo \| final \|.*\| 2 \| 2 \| 0\.00 \|", capfd.readouterr().out)
 
 
 @pytest.mark.parametrize(("visible", "expected"), [(None, "1"), ("4,6", "6")])

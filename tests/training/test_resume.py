@@ -25,6 +25,7 @@ from helpers import (
     train_here,
     wait_for_rows,
 )
+from shared_programs import shared_programs
 
 from mjx_walk.api import resolve
 from mjx_walk.runs import checkpoint
@@ -35,24 +36,43 @@ TASK = {"c": "env=walker2d", "jax": "env=inverted_pendulum", "warp": "env=walker
 """Without contacts, the `jax` engine compiles in a fraction of the time."""
 
 
+@pytest.fixture(autouse=True)
+def _programs_are_shared():
+    with shared_programs():
+        yield
+
+
 @pytest.fixture(scope="module")
 def six_calls(tmp_path_factory):
-    """The leaves after six uninterrupted calls, by engine."""
+    """A run of six uninterrupted calls, by engine."""
 
     @functools.cache
     def on(physics):
         run_dir = tmp_path_factory.mktemp("runs") / physics
         train_here(run_dir, TASK[physics], f"physics={physics}", f"total_steps={6 * TINY_CALL}")
-        return leaves(run_dir, 6)
+        return run_dir
 
     return on
+
+
+@pytest.fixture
+def two_calls(tmp_path, scored_run):
+    """A run of two calls that is finished and scored."""
+    return shutil.copytree(scored_run, tmp_path / "run")
+
+
+@pytest.fixture(scope="module")
+def scored_run(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("runs") / "scored"
+    train_here(run_dir, f"total_steps={2 * TINY_CALL}", "evaluation.gymnasium_episodes=1")
+    return run_dir
 
 
 @pytest.mark.parametrize("physics", slow_except(["c"], ["c", "jax", "warp"]))
 def test_n_and_n_calls_equal_2n(tmp_path, physics, six_calls):
     train_here(tmp_path / "halves", TASK[physics], f"physics={physics}", f"total_steps={3 * TINY_CALL}")
     train(tmp_path / "halves", "resume=true", f"total_steps={6 * TINY_CALL}", tiny=[])
-    full, halves = six_calls(physics), leaves(tmp_path / "halves", 6)
+    full, halves = leaves(six_calls(physics), 6), leaves(tmp_path / "halves", 6)
     assert full.keys() == halves.keys() and len(full) > 50
     for name, leaf in full.items():
         np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
@@ -72,7 +92,8 @@ def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
     """The first half ends after the replay has gone round, with truncated episodes in it."""
     train_here(tmp_path / "full", f"algo={algo}", f"total_steps={9 * TINY_CALL}", tiny=TINY_OFF_POLICY)
     train_here(tmp_path / "halves", f"algo={algo}", f"total_steps={5 * TINY_CALL}", tiny=TINY_OFF_POLICY)
-    train(tmp_path / "halves", f"algo={algo}", f"total_steps={9 * TINY_CALL}", "resume=true", tiny=TINY_OFF_POLICY)
+    more = (f"algo={algo}", f"total_steps={9 * TINY_CALL}", "resume=true")
+    (train if algo == "csac" else train_here)(tmp_path / "halves", *more, tiny=TINY_OFF_POLICY)
     full, halves = leaves(tmp_path / "full", 9), leaves(tmp_path / "halves", 9)
     assert full.keys() == halves.keys() and full["replay.rows"] == 72 and full["replay.cuts"].sum() > 0
     for name, leaf in full.items():
@@ -93,7 +114,7 @@ def test_policy_gradient_resume_is_exact(tmp_path, algo):
     tiny = [setting for setting in TINY if "num_epochs" not in setting]
     train_here(tmp_path / "full", *settings, f"total_steps={4 * TINY_CALL}", tiny=tiny)
     train_here(tmp_path / "halves", *settings, f"total_steps={2 * TINY_CALL}", tiny=tiny)
-    train(tmp_path / "halves", f"total_steps={4 * TINY_CALL}", "resume=true", tiny=[])
+    train_here(tmp_path / "halves", f"total_steps={4 * TINY_CALL}", "resume=true", tiny=[])
     full, halves = leaves(tmp_path / "full", 4), leaves(tmp_path / "halves", 4)
     assert full.keys() == halves.keys() and len(full) > 40 and ("exploration" in full) == (algo == "a2c")
     for name, leaf in full.items():
@@ -114,11 +135,11 @@ def test_a_replay_that_is_gone_is_filled_again(tmp_path):
 
 
 def test_a_damaged_checkpoint_costs_only_its_own_calls(tmp_path, six_calls):
-    train_here(tmp_path / "run", "physics=c", f"total_steps={4 * TINY_CALL}")
-    flip_a_byte(checkpoint.step_path(tmp_path / "run" / "checkpoints", 4 * TINY_CALL))
+    shutil.copytree(six_calls("c"), tmp_path / "run")
+    flip_a_byte(checkpoint.step_path(tmp_path / "run" / "checkpoints", 6 * TINY_CALL))
     with pytest.warns(UserWarning, match="damaged.*falling back"):
-        train_here(tmp_path / "run", f"total_steps={6 * TINY_CALL}", "resume=true", tiny=[])
-    full, run = six_calls("c"), leaves(tmp_path / "run", 6)
+        train_here(tmp_path / "run", "resume=true", tiny=[])
+    full, run = leaves(six_calls("c"), 6), leaves(tmp_path / "run", 6)
     for name, leaf in full.items():
         np.testing.assert_array_equal(leaf, run[name], err_msg=name)
     rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
@@ -159,9 +180,8 @@ def test_a_link_in_a_run_folder_is_refused_by_all_that_write(tmp_path, capsys, l
     assert [(file.name, file.read_text()) for file in outside.iterdir()] == [("precious", "mine")]
 
 
-def test_a_resume_that_fails_changes_nothing(tmp_path):
-    run_dir = tmp_path / "run"
-    train_here(run_dir, f"total_steps={2 * TINY_CALL}")
+def test_a_resume_that_fails_changes_nothing(two_calls):
+    run_dir = two_calls
     path = checkpoint.step_path(run_dir / "checkpoints", 2 * TINY_CALL)
     shutil.copytree(path, f"{path}.copy")  # which is no checkpoint of the run
     flip_a_byte(path)
@@ -171,9 +191,8 @@ def test_a_resume_that_fails_changes_nothing(tmp_path):
     assert (run_dir / "config.yaml").read_text() == before
 
 
-def test_a_run_that_was_scored_and_has_no_checkpoint_is_not_begun_again(tmp_path, capsys):
-    run_dir = tmp_path / "run"
-    train_here(run_dir, f"total_steps={TINY_CALL}", "evaluation.gymnasium_episodes=1")
+def test_a_run_that_was_scored_and_has_no_checkpoint_is_not_begun_again(two_calls, capsys):
+    run_dir = two_calls
     shutil.rmtree(run_dir / "checkpoints")
     before = {path.name: path.read_bytes() for path in run_dir.iterdir() if path.is_file()}
     assert command_here("train", f"run_dir={run_dir}", "resume=true") == 2
@@ -181,9 +200,9 @@ def test_a_run_that_was_scored_and_has_no_checkpoint_is_not_begun_again(tmp_path
     assert {path.name: path.read_bytes() for path in run_dir.iterdir() if path.is_file()} == before
 
 
-def test_a_run_that_saved_nothing_begins_again(tmp_path):
-    run_dir = tmp_path / "run"
-    train_here(run_dir, f"total_steps={2 * TINY_CALL}")
+def test_a_run_that_saved_nothing_begins_again(two_calls):
+    run_dir = two_calls
+    (run_dir / "eval_gymnasium.json").unlink()
     full = leaves(run_dir, 2)
     shutil.rmtree(run_dir / "checkpoints")
     (run_dir / "checkpoints").mkdir()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers import TINY, TINY_CALL, slow_except
 from jax._src import compiler
+from shared_programs import shared_programs
 
 import mjx_walk
 from mjx_walk import train as train_command
@@ -26,7 +27,8 @@ def test_the_same_seed_gives_the_same_run_and_another_does_not(tmp_path):
     losses = []
     for i, seed in enumerate((1, 1, 2)):
         run = [*TINY, f"run_dir={tmp_path}/{i}", f"total_steps={3 * TINY_CALL}", f"seed={seed}"]
-        losses.append([row["train/loss"] for row in mjx_walk.run(run).metrics[1:]])
+        with shared_programs():
+            losses.append([row["train/loss"] for row in mjx_walk.run(run).metrics[1:]])
     assert losses[0] == losses[1] != losses[2]
 
 
@@ -82,7 +84,8 @@ def test_a_call_is_logged_before_the_next_begins(tmp_path, monkeypatch):
 
     monkeypatch.setattr(programs._TwoPrograms, "__call__", begin)
     overrides = [*TINY, f"run_dir={tmp_path / 'run'}", f"total_steps={3 * TINY_CALL}"]
-    mjx_walk.run(overrides, on_metrics=lambda row: events.append("is logged"))
+    with shared_programs():
+        mjx_walk.run(overrides, on_metrics=lambda row: events.append("is logged"))
     assert events == 3 * ["begins", "is logged"]
 
 

@@ -9,6 +9,7 @@ import warnings
 
 import pytest
 from helpers import ENVIRONMENT, TINY, TINY_CALL, command_here
+from shared_programs import shared_programs
 
 import mjx_walk
 from mjx_walk.utils import cli
@@ -40,10 +41,11 @@ def test_a_warning_from_two_places_is_shown_once():
 
 
 def test_from_python_a_run_is_quiet_and_logs(tmp_path, capfd, caplog):
-    mjx_walk.run([*TINY, f"run_dir={tmp_path}/quiet", f"total_steps={TINY_CALL}"])
+    with shared_programs():
+        mjx_walk.run([*TINY, f"run_dir={tmp_path}/quiet", f"total_steps={TINY_CALL}"])
     printed = capfd.readouterr()
     assert "Training" not in printed.out and "steps" not in printed.err
-    with caplog.at_level(logging.INFO, logger="mjx_walk"):
+    with caplog.at_level(logging.INFO, logger="mjx_walk"), shared_programs():
         mjx_walk.run([*TINY, f"run_dir={tmp_path}/logged", f"total_steps={TINY_CALL}"])
     assert "Training walker2d with ppo on the CPU, physics=c" in caplog.text and "64 steps" in caplog.text
 
