@@ -118,8 +118,10 @@ def _present(key: str, recorded: dict[str, str], options: TaskOptions) -> tuple[
     if key == _MODEL:
         model = options.xml_file or TASKS[options.name][0].XML_FILES.get(options.version)
         path = model_path(model) if model else None
+        if path is None or path.name not in recorded:  # another model: the settings differ, too
+            return None, {}
         try:
-            return (path.parent, source_hashes(str(model)) if path.is_file() else {}) if path else (None, {})
+            return path.parent, source_hashes(str(model)) if path.is_file() else {}
         except OSError:
             return None, {}  # loading the model reports it
     source = {_REWARD: options.reward_function, _TASK: options.task}.get(key)

@@ -67,6 +67,8 @@ def test_a_changed_model_is_refused_at_a_resume_and_named_by_a_player(home, caps
     says = f"error: {home}/motors.xml has changed since run was trained; to continue with it as it is now, add "
     assert refused(capsys) == says + f"env.xml_file={home}/robot.xml"
     assert refused(capsys, "seed=0") == says + f"env.xml_file={home}/robot.xml"
+    other = refused(capsys, "env=walker2d", *SETTINGS)
+    assert "run was trained with other settings: " in other and "env.xml_file (was " in other
     shutil.move("run", "elsewhere")
     with pytest.warns(UserWarning, match=f"{home}/motors.xml has changed since elsewhere was trained; it is used"):
         mjx_walk.load_run("elsewhere")
