@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+import warnings
 from pathlib import Path
 
 import gymnasium
@@ -10,6 +11,7 @@ import pytest
 from helpers import OLD_RUNS, TINY, TINY_CALL, command_here, train_here
 
 import mjx_walk
+from mjx_walk import api
 from mjx_walk.experiments.planned_runs import plan
 from mjx_walk.utils.errors import UserError
 
@@ -75,10 +77,23 @@ def test_a_changed_model_is_refused_at_a_resume_and_named_by_a_player(home, caps
     shutil.move("elsewhere", "run")
     (home / "motors.xml").write_text(original)
     mjx_walk.load_run("run")
-    change(home / "motors.xml")
+
+
+@pytest.mark.slow  # two trainings
+def test_a_model_that_is_named_again_is_the_model_of_the_run(home):
+    """Also from the folder to which it has moved."""
+    (home / "moved").mkdir()
+    for name in ("robot.xml", "motors.xml"):
+        shutil.move(home / name, home / "moved" / name)
+    named = ["run_dir=run", "resume=true", "env.xml_file=moved/robot.xml"]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        mjx_walk.run([*named, f"total_steps={2 * TINY_CALL}"])
+    assert not [warning for warning in caught if "has changed since" in str(warning.message)]
+    change(home / "moved" / "motors.xml")
     with pytest.warns(UserWarning, match="it continues with it"):
-        mjx_walk.run(["run_dir=run", "resume=true", "env.xml_file=robot.xml", f"total_steps={2 * TINY_CALL}"])
-    mjx_walk.run(["run_dir=run", "resume=true", f"total_steps={3 * TINY_CALL}"])  # it is recorded
+        mjx_walk.run([*named, f"total_steps={3 * TINY_CALL}"])
+    assert api.resolve(["run_dir=run", "resume=true"]).env.xml_file == f"{home}/moved/robot.xml"  # it is recorded
 
 
 def test_a_reward_that_another_run_has_named_is_refused(home, capsys):
@@ -94,7 +109,7 @@ def test_a_reward_that_another_run_has_named_is_refused(home, capsys):
     mjx_walk.load_run("run")  # which does not run it
 
 
-def test_a_model_that_is_gone_or_has_moved(home, capsys, recwarn):
+def test_a_model_that_is_gone_is_named(home, capsys):
     (home / "moved").mkdir()
     for name in ("robot.xml", "motors.xml"):
         shutil.move(home / name, home / "moved" / name)
@@ -103,8 +118,6 @@ def test_a_model_that_is_gone_or_has_moved(home, capsys, recwarn):
     )
     with pytest.raises(UserError, match=r"robot\.xml; restore it, or correct env.xml_file in run/config\.yaml"):
         mjx_walk.load_run("run")
-    mjx_walk.run(["run_dir=run", "resume=true", "env.xml_file=moved/robot.xml", f"total_steps={2 * TINY_CALL}"])
-    assert not [warning for warning in recwarn if "has changed since" in str(warning.message)]
 
 
 def test_a_comparison_does_not_mix_models(home):

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import hydra
+import pytest
 from helpers import ENVIRONMENT
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -66,6 +67,7 @@ def test_the_state_of_hydra_is_the_one_from_before(tmp_path):
         OmegaConf.clear_resolver("now")
 
 
+@pytest.mark.slow  # a process of its own
 def test_a_program_of_hydras_calls_this_package(tmp_path):
     """Also in a sweep, in which Hydra goes on after each job."""
     (tmp_path / "theirs.py").write_text(PROGRAM)
