@@ -106,9 +106,10 @@ def test_files_they_link_to_are_there():
     for page, text in PAGES.items():
         for target in re.findall(r"\]\(([^)\s]+)\)", text):
             name, _, heading = target.partition("#")
-            assert target.startswith("http") or (page.parent / name).exists(), f"{page}: {target}"
+            linked = page.parent / name if name else page
+            assert target.startswith("http") or linked.exists(), f"{page}: {target}"
             if heading and not target.startswith("http"):
-                headings = re.findall(r"^#+ (.*)$", (page.parent / name).read_text(), flags=re.MULTILINE)
+                headings = re.findall(r"^#+ (.*)$", linked.read_text(), flags=re.MULTILINE)
                 assert heading in map(slug, headings), f"{page}: {target}"
 
 

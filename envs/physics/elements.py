@@ -128,9 +128,11 @@ def _is_chain(model: mujoco.MjModel, dofs: Shaped[np.ndarray, " n"]) -> bool:
 
 def balanced_bodies(model: mujoco.MjModel) -> Shaped[np.ndarray, " bodies"]:
     """Moving bodies with contacts whose centre of mass no joint moves. MJX's solver divides by their inertia, zero."""
+    from mujoco.mjx._src import collision_driver
+
     moves = model.body_dofnum[model.body_weldid] > 0
     collides = np.zeros(model.nbody, bool)
-    collides[model.geom_bodyid[(model.geom_contype | model.geom_conaffinity) != 0]] = True
-    collides[model.geom_bodyid[[*model.pair_geom1, *model.pair_geom2]]] = True
+    for *geoms, _ in collision_driver.geom_pairs(model):
+        collides[model.geom_bodyid[geoms]] = True
     is_off = model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     return moves & collides & (model.body_invweight0[:, 0] < mujoco.mjMINVAL) & (not is_off)
