@@ -85,7 +85,7 @@ def test_own_task(tmp_path):
     settings = (*SMALL, f"env.task={tmp_path}/backward.py:Backward", "recipe=gpu/half_cheetah_ppo")
     run("train", *settings, f"run_dir={tmp_path}/run", "total_steps=1", cwd=tmp_path)
     (row,) = checked_rows(tmp_path / "run", 1)
-    assert np.isfinite([row["episode/reward_back"], row["episode/reward_calm"]]).all() or "episode/return" not in row
+    assert np.isfinite(list(row.values())).all()
     assert "Final policy" in run("eval", f"run={tmp_path}/run", "episodes=4", cwd=tmp_path)
 
 
