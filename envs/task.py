@@ -259,9 +259,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 
         valid = is_finite((physics.qpos, physics.qvel)) & is_finite((physics.qacc_warmstart, obs, reward), jnp.inf)
         physics, carry, obs = jax.tree.map(
-            lambda new, old: jnp.where(valid, new, old),
-            (physics, carry, obs),
-            (state.physics, state.memory, state.obs),
+            lambda new, old: jnp.where(valid, new, old), (physics, carry, obs), (state.physics, state.memory, state.obs)
         )
         # A float32 zero: weakly typed metrics would compile every program twice.
         zero = jnp.float32(0.0)
