@@ -128,6 +128,7 @@ def _is_chain(model: mujoco.MjModel, dofs: Shaped[np.ndarray, " n"]) -> bool:
 
 def balanced_bodies(model: mujoco.MjModel) -> Shaped[np.ndarray, " bodies"]:
     """Moving bodies with contacts whose centre of mass no joint moves. MJX's solver divides by their inertia, zero."""
+    from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
     from mujoco.mjx._src import collision_driver
 
     moves = model.body_dofnum[model.body_weldid] > 0
