@@ -3,10 +3,12 @@
     python tests/derived_arrays.py [--engines c jax warp] [--models NAME ...] [--alone]
 
 It prints a table of arrays by engine and moment: equal, refused, or the largest error relative to the largest value.
+It exits with code 1 if an array that is not refused differs.
 The reference does what Gymnasium does: `mj_forward` at a reset; `mj_step`, then `mj_rnePostConstraint`, in a step.
 """
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -141,7 +143,7 @@ def sweep(model: mujoco.MjModel, engine: str, is_alone: bool) -> dict[str, list[
     return found
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--engines", nargs="+", choices=ENGINES, default=ENGINES)
     parser.add_argument("--models", nargs="+", choices=list(MODELS), default=list(MODELS))
@@ -168,6 +170,7 @@ def main() -> None:
                     print(f"{name}: {array} on {engine}: {found[array]}", flush=True)
             print(f"{name} on {engine}: {len(found)} arrays compared", flush=True)
     _print_table(array_names(model), arguments, worst, refused)
+    return int(any(max(found) > TOLERANCE[engine] for (_, engine), found in worst.items()))
 
 
 def _print_table(names: list[str], arguments: argparse.Namespace, worst: dict, refused: dict) -> None:
@@ -187,4 +190,4 @@ def _print_table(names: list[str], arguments: argparse.Namespace, worst: dict, r
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -119,13 +119,13 @@ def start(module: str, *arguments: str, seconds=300, env=None, **kwargs) -> subp
     return process
 
 
-def wait_for_line(process: subprocess.Popen, text: str) -> None:
-    """Block until a started command prints a line that contains a text."""
+def wait_for_line(process: subprocess.Popen, text: str) -> str:
+    """Block until a started command prints a line that contains a text. Returns the line."""
     printed = []
     for line in process.stdout:
         printed.append(line)
         if text in line:
-            return
+            return line
     raise AssertionError(f"ended before '{text}':\n{''.join(printed)}")
 
 

@@ -12,6 +12,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from xla_flags import quick_compile
+
 CLONE = Path(__file__).parent.parent
 TRAIN = (
     "python -m mjx_walk.train env=inverted_pendulum num_envs=8 total_steps=128 iterations_per_call=1 "
@@ -161,7 +163,7 @@ def run(case: Case) -> tuple[int, str, str, float]:
         command = f"{case.runner} bash -c 'trap : TERM; eval \"$COMMAND\" {case.redirect}'"
         paths = os.pathsep.join([str(CLONE), *filter(None, [os.environ.get("PYTHONPATH")])])
         env = os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu", "COMMAND": case.command}
-        env["XLA_FLAGS"] = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"  # compiles quickly
+        env["XLA_FLAGS"] = quick_compile(0)
         env["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), env["PATH"]])
         started = time.monotonic()
         script = f"{case.before}\n{command}"

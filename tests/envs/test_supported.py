@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 from mujoco.mjx._src import collision_driver
+from trajectories import visited_states
 
 from mjx_walk.envs.physics import PhysicsState, make_engine, static_pairs
 from mjx_walk.envs.physics.jax_model import adapt_model
@@ -214,27 +215,12 @@ def test_spring_and_damper_flags_on_the_jax_engine(flags, kept):
     assert (model.jnt_stiffness.any(), model.dof_damping.any()) == kept and not model.opt.disableflags
 
 
-def visited(model, num_envs=8, num_steps=10):
-    """States on trajectories of the `c` engine under random controls, and the controls."""
-    rng = np.random.default_rng(0)
-    qpos = model.qpos0 + 0.02 * rng.normal(size=(num_envs, model.nq))
-    qvel = 0.5 * rng.normal(size=(num_envs, model.nv))
-    state = PhysicsState(jnp.float32(qpos), jnp.float32(qvel), jnp.zeros((num_envs, model.nv)))
-    step = jax.jit(jax.vmap(make_engine("c", model, 3, ()).step))
-    states, controls = [], []
-    for _ in range(num_steps):
-        states.append(state)
-        controls.append(jnp.float32(rng.uniform(-2, 2, (num_envs, model.nu))))
-        state = step(state, controls[-1])[0]
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *states), jnp.concatenate(controls)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", MJX)
 @pytest.mark.parametrize("name", SIMULATED)
 def test_simulated_as_by_the_c_engine(name, engine):
     model = load(SIMULATED[name])
-    states, controls = visited(model)
+    states, controls = visited_states(model, num_envs=8, num_steps=10)
     expected, found = (
         np.asarray(jax.jit(jax.vmap(make_engine(one, model, 1, ()).step))(states, controls)[0].qvel)
         for one in ("c", engine)

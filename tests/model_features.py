@@ -1,6 +1,6 @@
 """Command: every feature of `feature_models`, alone and with others, on an MJX engine against the `c` engine.
 
-    python tests/envs/model_features.py --engines jax --settings no_damper --groups joint tendon --pairs
+    python tests/model_features.py --engines jax --settings no_damper --groups joint tendon --pairs
 
 A setting is an option or a flag. Each run is a world with one setting, where many small models with one feature (with
 `--pairs`: with two) stand apart. A case is `equal`, `differs`, `refused` in one line, an `error`, or `invalid`: MuJoCo
@@ -17,13 +17,14 @@ from typing import NamedTuple
 
 import feature_models
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from feature_models import Features
 from features import FLAGS, GROUPS, OPTIONS
+from trajectories import visited_states
+from xla_flags import quick_compile
 
-from mjx_walk.envs.physics import PhysicsState, make_engine, mjx_model
+from mjx_walk.envs.physics import make_engine, mjx_model
 from mjx_walk.envs.physics.supported import refuse_unsupported
 from mjx_walk.utils.errors import UserError
 
@@ -47,21 +48,6 @@ class Outcome(NamedTuple):
     detail: str = ""
 
 
-def visited(model: mujoco.MjModel, num_envs: int = 8, num_steps: int = 3):
-    """States on trajectories of the `c` engine under random controls, and the controls."""
-    rng = np.random.default_rng(0)
-    qpos = model.qpos0 + 0.02 * rng.normal(size=(num_envs, model.nq))
-    qvel = 0.5 * rng.normal(size=(num_envs, model.nv))
-    state = PhysicsState(jnp.float32(qpos), jnp.float32(qvel), jnp.zeros((num_envs, model.nv)))
-    step = jax.jit(jax.vmap(make_engine("c", model, 3, ()).step))
-    states, controls = [], []
-    for _ in range(num_steps):
-        states.append(state)
-        controls.append(jnp.float32(rng.uniform(-2, 2, (num_envs, model.nu))))
-        state = step(state, controls[-1])[0]
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *states), jnp.concatenate(controls)
-
-
 def errors(model: mujoco.MjModel, engine: str, owners: list[int]) -> list[np.ndarray]:
     """Errors of velocities after a step, relative to one plus the change of the exhibit's fastest.
 
@@ -73,7 +59,7 @@ def errors(model: mujoco.MjModel, engine: str, owners: list[int]) -> list[np.nda
     Returns:
         For each exhibit, the largest error in each visited state.
     """
-    states, controls = visited(model)
+    states, controls = visited_states(model, num_envs=8, num_steps=3)
     expected, found = (
         np.asarray(jax.jit(jax.vmap(make_engine(one, model, NUM_SUBSTEPS, ()).step))(states, controls)[0].qvel)
         for one in ("c", engine)
@@ -118,7 +104,9 @@ def _simulated(cases: list[Case], settings: Features) -> Iterator[tuple[Case, Ou
     shared = [case for case in cases if feature_models.is_local(case.features)]
     rooms = [shared[i : i + size] for i in range(0, len(shared), size)]
     for room in [*rooms, *([case] for case in cases if case not in shared)]:
-        option = f'integrator="{integrator}" jacobian="dense"'
+        option = f'integrator="{integrator}"'
+        if not {"sparse", "dense"} & {*settings}:
+            option += ' jacobian="dense"'
         if room[0] in shared:
             model = feature_models.gallery([case.features for case in room], settings, option=option)
             owners = feature_models.exhibit_of_dofs(model)
@@ -147,8 +135,7 @@ def _simulated(cases: list[Case], settings: Features) -> Iterator[tuple[Case, Ou
 def compile_quickly() -> None:
     """Tell XLA to compile quickly, on the CPU unless the user chooses."""
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    flags = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-    os.environ["XLA_FLAGS"] = f"{flags} {os.environ.get('XLA_FLAGS', '')}"
+    os.environ["XLA_FLAGS"] = f"{quick_compile(0)} {os.environ.get('XLA_FLAGS', '')}"
 
 
 def let_solver_converge() -> None:
