@@ -10,7 +10,10 @@ from jaxtyping import Shaped
 Users = Callable[[mujoco.MjModel], Iterator[str]]
 """The elements of a model that use a feature, as `kind 'name'`."""
 
-_SPOKEN = {"actuator": "motor", "eq": "equality constraint"}
+LEAST_PYRAMIDAL_FRICTION = 0.05
+"""Above it, velocities after a step differ from C's by less than 1e-3 of their change."""
+
+_SPOKEN = {"actuator": "motor", "eq": "equality constraint", "pair": "contact pair"}
 
 
 def named(
@@ -102,6 +105,33 @@ def unmoved_tendons(model: mujoco.MjModel) -> Shaped[np.ndarray, " tendons"]:
     for tied in (model.eq_obj1id[is_tendon], model.eq_obj2id[is_tendon]):
         is_constrained[tied[tied >= 0]] = True
     return is_constrained & (model.tendon_invweight0 < mujoco.mjMINVAL)
+
+
+def slippery_contacts(model: mujoco.MjModel) -> Iterator[str]:
+    """Pairs of geoms whose pyramidal contacts have little friction.
+
+    A pyramidal contact divides by the square of its friction, and MJX computes in float32.
+    """
+    from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
+    from mujoco.mjx._src import collision_driver
+
+    is_off = model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    if is_off or model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        return
+    moves = model.body_dofnum[model.body_weldid] > 0
+    for *geoms, pair in collision_driver.geom_pairs(model):
+        condim, friction = _contact_friction(model, geoms, pair)
+        if condim > 1 and friction < LEAST_PYRAMIDAL_FRICTION and moves[model.geom_bodyid[geoms]].any():
+            yield "geoms " + " and ".join(f"'{model.geom(int(geom)).name or geom}'" for geom in geoms)
+
+
+def _contact_friction(model: mujoco.MjModel, geoms: list[int], pair: int) -> tuple[int, float]:
+    """Dimension and sliding friction of the contacts of two geoms, as C combines them."""
+    if pair >= 0:
+        return model.pair_dim[pair], model.pair_friction[pair, 0]
+    priority = model.geom_priority[geoms]
+    used = [geom for geom, own in zip(geoms, priority, strict=True) if own == priority.max()]
+    return model.geom_condim[used].max(), model.geom_friction[used, 0].max()
 
 
 def branching_armatures(model: mujoco.MjModel) -> Shaped[np.ndarray, " tendons"]:

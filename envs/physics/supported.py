@@ -128,6 +128,12 @@ _FEATURES = (
     ),
     _Feature(
         _MJX,
+        elements.slippery_contacts,
+        "pyramidal contacts with a friction below 0.05",
+        'set cone="elliptic" in <option>, or condim="1" for contacts without friction',
+    ),
+    _Feature(
+        _MJX,
         elements.named("tendon", elements.unmoved_tendons),
         "a tendon with limits, friction or an equality that no joint moves in the model's own pose",
         "remove them",
@@ -159,6 +165,12 @@ _FEATURES = (
     _Feature(
         ("jax",),
         elements.named("geom", lambda m: elements.any_of(m.geom_adhesion)),
+        "adhesion",
+        "remove adhesion",
+    ),
+    _Feature(
+        ("jax",),
+        elements.named("pair", lambda m: elements.any_of(m.pair_adhesion)),
         "adhesion",
         "remove adhesion",
     ),

@@ -112,6 +112,26 @@ REFUSED = {
         "the armature of a tendon across branches as MuJoCo does (tendon 't')",
     ),
     "adhesion": (JAX, {"torso": f'{SPHERE} adhesion="4"'}, "adhesion (geom 'torso')"),
+    "slippery": (
+        MJX,
+        {"floor": 'friction=".04"', "torso": f'{SPHERE} friction=".01"', "shin": 'friction=".03"'},
+        "friction below 0.05 (geoms 'floor' and",
+    ),
+    "slippery_by_priority": (
+        MJX,
+        {"floor": 'friction="0" priority="1"'},
+        "friction below 0.05 (geoms 'floor' and",
+    ),
+    "slippery_pair": (
+        MJX,
+        {"contact": '<pair geom1="floor" geom2="torso" friction=".02"/>'},
+        "friction below 0.05 (geoms 'floor' and 'torso')",
+    ),
+    "pair_adhesion": (
+        JAX,
+        {"contact": '<pair name="sticky" geom1="floor" geom2="torso" adhesion="5"/>'},
+        "adhesion (contact pair 'sticky')",
+    ),
     "surfacevel": (JAX, {"floor": 'surfacevel="1 0 0 0 0 0"'}, "moving surfaces (geom 'floor')"),
     "ellipsoid_fluid": (
         JAX,
@@ -144,6 +164,13 @@ SIMULATED = {
     "margin": {"torso": f'{SPHERE} margin=".05" gap=".02"'},
     "pair": {"torso": SPHERE, "contact": '<pair geom1="floor" geom2="torso" friction=".1 .1 .1 .1 .1" condim="6"/>'},
     "max_contact_points": {"custom": '<numeric name="max_contact_points" data="1"/>'},
+    "elliptic_without_friction": {
+        "option": 'cone="elliptic"',
+        "floor": 'friction="0"',
+        "torso": f'{SPHERE} friction="0"',
+        "shin": 'friction="0"',
+    },
+    "condim1_without_friction": {"floor": 'friction="0" condim="1" priority="1"'},
     "frictionloss": {"knee": 'frictionloss=".3"'},
     "springdamper": {"knee": 'springdamper=".1 1"'},
     "actuatorfrcrange": {"knee": 'actuatorfrcrange="-.5 .5"'},
