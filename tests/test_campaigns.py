@@ -14,7 +14,6 @@ AS_A_USER = {"XLA_FLAGS": ""}
 SHORTER = {
     "ppo": ("total_steps=150000", "algo.schedule_steps=150000"),
     "td3": ("total_steps=100000", "algo.schedule_steps=100000"),
-    "a2c": (),
 }
 
 
@@ -27,7 +26,7 @@ def test_a_policy_is_good_after_the_cpu_recipe(tmp_path, env, algo, least, enoug
 
     After one call, a walker scores about 300 in Gymnasium.
     """
-    arguments = (f"env={env}", f"algo={algo}", *SHORTER[algo], "evaluation.gymnasium_episodes=0")
+    arguments = (f"env={env}", f"algo={algo}", *SHORTER.get(algo, ()), "evaluation.gymnasium_episodes=0")
     process = start("train", *arguments, f"run_dir={tmp_path}/run", seconds=2400, env=AS_A_USER)
     wait_for_row(process, tmp_path / "run", lambda row: row.get("eval/return", 0.0) >= enough)
     process.send_signal(signal.SIGTERM)

@@ -11,7 +11,7 @@ Users = Callable[[mujoco.MjModel], Iterator[str]]
 """The elements of a model that use a feature, as `kind 'name'`."""
 
 LEAST_PYRAMIDAL_FRICTION = 0.05
-"""Above it, velocities after a step differ from C's by less than 1e-3 of their change."""
+"""With it, velocities after a step differ from C's by at most 1.1e-3, relative to one plus their change."""
 
 _SPOKEN = {"actuator": "motor", "eq": "equality constraint", "pair": "contact pair"}
 
@@ -112,17 +112,29 @@ def slippery_contacts(model: mujoco.MjModel) -> Iterator[str]:
 
     A pyramidal contact divides by the square of its friction, and MJX computes in float32.
     """
+    if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        return
+    for geoms, pair in _pairs_that_move(model):
+        condim, friction = _contact_friction(model, geoms, pair)
+        if condim > 1 and friction < LEAST_PYRAMIDAL_FRICTION:
+            yield "geoms " + " and ".join(f"'{model.geom(int(geom)).name or geom}'" for geom in geoms)
+
+
+def _pairs_that_move(model: mujoco.MjModel) -> Iterator[tuple[list[int], int]]:
+    """Pairs of geoms that may touch, of which at least one moves, and the index of their `<pair>`, or -1."""
     from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
     from mujoco.mjx._src import collision_driver
 
-    is_off = model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    if is_off or model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
+    if model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
         return
-    moves = model.body_dofnum[model.body_weldid] > 0
+    moves = _moving_bodies(model)
     for *geoms, pair in collision_driver.geom_pairs(model):
-        condim, friction = _contact_friction(model, geoms, pair)
-        if condim > 1 and friction < LEAST_PYRAMIDAL_FRICTION and moves[model.geom_bodyid[geoms]].any():
-            yield "geoms " + " and ".join(f"'{model.geom(int(geom)).name or geom}'" for geom in geoms)
+        if moves[model.geom_bodyid[geoms]].any():
+            yield geoms, pair
+
+
+def _moving_bodies(model: mujoco.MjModel) -> Shaped[np.ndarray, " bodies"]:
+    return model.body_dofnum[model.body_weldid] > 0
 
 
 def _contact_friction(model: mujoco.MjModel, geoms: list[int], pair: int) -> tuple[int, float]:
@@ -158,12 +170,7 @@ def _is_chain(model: mujoco.MjModel, dofs: Shaped[np.ndarray, " n"]) -> bool:
 
 def balanced_bodies(model: mujoco.MjModel) -> Shaped[np.ndarray, " bodies"]:
     """Moving bodies with contacts whose centre of mass no joint moves. MJX's solver divides by their inertia, zero."""
-    from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
-    from mujoco.mjx._src import collision_driver
-
-    moves = model.body_dofnum[model.body_weldid] > 0
     collides = np.zeros(model.nbody, bool)
-    for *geoms, _ in collision_driver.geom_pairs(model):
+    for geoms, _ in _pairs_that_move(model):
         collides[model.geom_bodyid[geoms]] = True
-    is_off = model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    return moves & collides & (model.body_invweight0[:, 0] < mujoco.mjMINVAL) & (not is_off)
+    return _moving_bodies(model) & collides & (model.body_invweight0[:, 0] < mujoco.mjMINVAL)

@@ -129,7 +129,7 @@ _FEATURES = (
     _Feature(
         _MJX,
         elements.slippery_contacts,
-        "pyramidal contacts with a friction below 0.05",
+        f"pyramidal contacts with a friction below {elements.LEAST_PYRAMIDAL_FRICTION}",
         'set cone="elliptic" in <option>, or condim="1" for contacts without friction',
     ),
     _Feature(

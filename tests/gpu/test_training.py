@@ -55,8 +55,8 @@ def test_bench_of_two_gpus(record_property):
     for size in (2048, 1024):
         lines.append(wait_for_line(process, f"training, 2 x {size} environments"))
     process.send_signal(signal.SIGTERM)
-    process.communicate()
-    assert process.returncode == 128 + signal.SIGTERM
+    output, _ = process.communicate()
+    assert process.returncode == 128 + signal.SIGTERM, output
     record_property("measured", "; ".join(" ".join(line.split()) for line in lines))
 
 

@@ -163,35 +163,29 @@ def own_leaves(tiny):
     return dict(zip(checkpoint._named_leaves(shapes), mark_flags(shapes, "per_device"), strict=True))
 
 
-def trained_on_two(run_dir, tiny):
-    """Train four calls on two devices and check that they learned the same from environments of their own."""
-    scored = run(run_dir, f"total_steps={4 * CALL}", "evaluation.gymnasium_episodes=1", tiny=tiny)
+@pytest.mark.slow
+@pytest.mark.parametrize("tiny", [TINY, (*TINY_OFF_POLICY, "algo=sac")])
+def test_two_processes_learn_the_same_and_resume_exactly(tmp_path, tiny):
+    scored = run(tmp_path / "full", f"total_steps={4 * CALL}", "evaluation.gymnasium_episodes=1", tiny=tiny)
     assert "2 ×" in scored.stdout and f"Final policy (step {4 * CALL} of {4 * CALL}), Walker2d-v5: " in scored.stdout
-    first, second = newest(run_dir)
+    first, second = newest(tmp_path / "full")
     is_own = own_leaves(tiny)
     for name, leaf in first.items():
         assert is_own[name] or np.array_equal(leaf, second[name]), name
     assert not np.array_equal(first["env.env.obs"], second["env.env.obs"])
-    rows = read_rows(run_dir / "metrics.jsonl")
-    assert [row["env_steps"] for row in rows] == [CALL, 2 * CALL, 3 * CALL, 4 * CALL]
-
-
-@pytest.mark.slow
-def test_two_processes_learn_the_same_and_one_resumes(tmp_path):
-    trained_on_two(tmp_path / "run", TINY)
-    run(tmp_path / "run", f"total_steps={6 * CALL}", "evaluation.gymnasium_episodes=1", "resume=true", devices=1)
-
-
-@pytest.mark.slow
-def test_two_processes_learn_the_same_and_resume_exactly_and_three_resume(tmp_path):
-    tiny = (*TINY_OFF_POLICY, "algo=sac")
-    trained_on_two(tmp_path / "full", tiny)
+    assert [row["env_steps"] for row in read_rows(tmp_path / "full" / "metrics.jsonl")] == [
+        CALL,
+        2 * CALL,
+        3 * CALL,
+        4 * CALL,
+    ]
     run(tmp_path / "parted", f"total_steps={2 * CALL}", tiny=tiny)
     run(tmp_path / "parted", f"total_steps={4 * CALL}", "resume=true", tiny=tiny)
     for one, two in zip(newest(tmp_path / "full"), newest(tmp_path / "parted"), strict=True):
         for name, leaf in one.items():
             np.testing.assert_array_equal(leaf, two[name], err_msg=name)
-    run(tmp_path / "parted", f"total_steps={10 * CALL}", "resume=true", tiny=tiny, devices=3)
+    devices = 1 if tiny is TINY else 3
+    run(tmp_path / "parted", f"total_steps={(4 + 2 * devices) * CALL}", "resume=true", tiny=tiny, devices=devices)
 
 
 @pytest.mark.slow
