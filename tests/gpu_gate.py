@@ -5,12 +5,13 @@
 
 import importlib.util
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from helpers import CLONE
+from helpers import CLONE, kill_after
 
 from mjx_walk.runs.metrics import read_rows
 
@@ -55,8 +56,11 @@ def require(*modules: str) -> None:
 
 
 def start(module: str, *arguments: str, count: int = 1, **options) -> subprocess.Popen:
-    """Start `python -m mjx_walk.MODULE ARGUMENTS` on that many GPUs. Its output and its errors are one stream."""
-    return subprocess.Popen(
+    """Start `python -m mjx_walk.MODULE ARGUMENTS` on that many GPUs. Its output and its errors are one stream.
+
+    It is killed after `_SECONDS`.
+    """
+    process = subprocess.Popen(
         [sys.executable, "-m", f"mjx_walk.{module}", *arguments],
         env=on_gpus(count),
         stdout=subprocess.PIPE,
@@ -64,16 +68,14 @@ def start(module: str, *arguments: str, count: int = 1, **options) -> subprocess
         text=True,
         **options,
     )
+    kill_after(process, _SECONDS)
+    return process
 
 
 def finish(process: subprocess.Popen) -> str:
     """Wait for a command. Returns its output, after it has ended with 0."""
-    try:
-        output, _ = process.communicate(timeout=_SECONDS)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        output, _ = process.communicate()
-        raise AssertionError(f"not done after {_SECONDS} s:\n{output[-3000:]}") from None
+    output, _ = process.communicate()
+    assert process.returncode != -signal.SIGKILL, f"killed, at the latest after {_SECONDS} s:\n{output[-3000:]}"
     assert process.returncode == 0, f"{process.args}\n{output[-6000:]}"
     return output
 

@@ -113,10 +113,15 @@ def start(module: str, *arguments: str, seconds=300, env=None, **kwargs) -> subp
         env=ENVIRONMENT | (env or {}),
         **kwargs,
     )
+    kill_after(process, seconds)
+    return process
+
+
+def kill_after(process: subprocess.Popen, seconds: float) -> None:
+    """Kill a process if it is still running after so many seconds."""
     limit = threading.Timer(seconds, process.kill)
     limit.daemon = True
     limit.start()
-    return process
 
 
 def wait_for_line(process: subprocess.Popen, text: str) -> str:
