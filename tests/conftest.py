@@ -32,7 +32,7 @@ if _QUICK_COMPILE not in _FLAGS:  # pytest-xdist's workers inherit the flags
     os.environ["XLA_FLAGS"] = f"{_QUICK_COMPILE} {SAFE_REDUCTIONS} {_FLAGS}".rstrip()
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _temporary_folder()
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 
 def pytest_collection_finish():

@@ -21,7 +21,7 @@ import jax
 import mujoco
 import numpy as np
 from feature_models import Features
-from features import FLAGS, GROUPS, OPTIONS
+from features import FEATURES, FLAGS, GROUPS, OPTIONS
 from trajectories import visited_states
 from xla_flags import quick_compile
 
@@ -73,10 +73,18 @@ def errors(model: mujoco.MjModel, engine: str, owners: list[int]) -> list[np.nda
     return by_exhibit
 
 
+def options(integrator: str, features: Features) -> str:
+    """Attributes of a world's `option`, less those that a feature gives itself."""
+    given = {"integrator": integrator, "jacobian": "dense"}
+    text = " ".join(FEATURES[name].get("option", "") for name in features)
+    return " ".join(f'{name}="{value}"' for name, value in given.items() if f'{name}="' not in text)
+
+
 def refusal(case: Case, settings: Features) -> Outcome | None:
     """The outcome of a case that needs no simulation."""
+    everything = (*settings, *case.features)
     try:
-        model = feature_models.load(*settings, *case.features, option=f'integrator="{case.integrator}"')
+        model = feature_models.load(*everything, option=options(case.integrator, everything))
     except ValueError as error:
         return Outcome("invalid", str(error).splitlines()[0])
     try:
@@ -105,14 +113,13 @@ def _simulated(cases: list[Case], settings: Features) -> Iterator[tuple[Case, Ou
     shared = [case for case in cases if feature_models.is_local(case.features)]
     rooms = [shared[i : i + size] for i in range(0, len(shared), size)]
     for room in [*rooms, *([case] for case in cases if case not in shared)]:
-        option = f'integrator="{integrator}"'
-        if not {"sparse", "dense"} & {*settings}:
-            option += ' jacobian="dense"'
         if room[0] in shared:
+            option = options(integrator, settings)
             model = feature_models.gallery([case.features for case in room], settings, option=option)
             owners = feature_models.exhibit_of_dofs(model)
         else:
-            model = feature_models.load(*settings, *room[0].features, option=option)
+            everything = (*settings, *room[0].features)
+            model = feature_models.load(*everything, option=options(integrator, everything))
             owners = [0] * model.nv
         try:
             found = errors(model, engine, owners)
