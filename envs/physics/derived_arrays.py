@@ -30,12 +30,14 @@ _EVERY = {
 }
 _NOT_JAX = {
     *("M", "qfrc_spring", "qfrc_damper", "qfrc_adhesion", "light_xpos", "light_xdir", "ten_J", "ten_wrapadr"),
-    *("ten_wrapnum", "actuator_moment", "moment_rownnz", "moment_rowadr", "moment_colind"),
+    *("ten_wrapnum", "moment_rownnz"),
 }
+_ORDERED_BY_CHANCE = {"actuator_moment", "moment_rowadr", "moment_colind"}
+"""Sparse rows that Warp's threads on a GPU place in the order in which they get there."""
 _ONLY_C = {
     *("qLD", "qLDiagInv", "qH", "qHDiagInv", "qDeriv", "qLU", "qfrc_inverse", "energy", "solver_fwdinv"),
     *("flexvert_xpos", "flexelem_aabb", "flexedge_J", "flexedge_length", "flexedge_velocity"),
-    *("flexvert_J", "flexvert_length"),
+    *("flexvert_J", "flexvert_length", *_ORDERED_BY_CHANCE),
 }
 _MISSING = {"c": frozenset(), "warp": _ONLY_C, "jax": _ONLY_C | _NOT_JAX}
 """Arrays that an engine lacks, or stores in another layout."""
@@ -98,6 +100,9 @@ def _reasons(model: mujoco.MjModel, engine: str, name: str) -> Iterator[str]:
     if name == "sensordata":
         for sensor in _sensors(model, _OTHER_SENSORS[engine]):
             yield f"physics={engine} computes {sensor} otherwise than MuJoCo; use physics=c, or remove it"
+        if engine == "warp":
+            for sensor in _sensors(model, (_Sensor.mjSENS_CONTACT,), _keeps_every_contact(model)):
+                yield f"physics=warp gives the contacts of {sensor} in no fixed order; set its reduce, or use physics=c"
     if name in _SENSOR_ARRAYS and model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         yield 'MJX computes sensors at another stage of RK4 than MuJoCo; use integrator="Euler" or physics=c'
     if engine == "jax" and name in ("cfrc_int", "cfrc_ext") and _has_spatial_tendon(model):
@@ -114,10 +119,18 @@ def _unknown(model: mujoco.MjModel, name: str) -> str:
     return f"MuJoCo's mjData has no array '{name}'" + (f" (did you mean: {', '.join(near)}?)" if near else "")
 
 
-def _sensors(model: mujoco.MjModel, kinds: tuple[mujoco.mjtSensor, ...]) -> Iterator[str]:
-    """The sensors of these kinds."""
-    for i in np.flatnonzero(np.isin(model.sensor_type, kinds)):
+def _sensors(
+    model: mujoco.MjModel, kinds: tuple[mujoco.mjtSensor, ...], where: np.ndarray | bool = True
+) -> Iterator[str]:
+    """The sensors of these kinds, of those that `where` marks."""
+    for i in np.flatnonzero(np.isin(model.sensor_type, kinds) & where):
         yield f"sensor '{model.sensor(int(i)).name or i}'"
+
+
+def _keeps_every_contact(model: mujoco.MjModel) -> np.ndarray:
+    """For contact sensors: whether they list contacts as they come, and more of them than their number."""
+    fields, reduce, _ = model.sensor_intprm.T
+    return (reduce == 0) & (fields != 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND))
 
 
 def _has_spatial_tendon(model: mujoco.MjModel) -> bool:

@@ -10,6 +10,7 @@ from mujoco.mjx._src import smooth as mjx_smooth
 from rich_model import sensors
 
 from mjx_walk.envs.physics import ENGINES, PhysicsState, make_engine
+from mjx_walk.envs.physics.derived_arrays import refuse_derived
 from mjx_walk.utils.errors import UserError
 
 PENDULUM = """
@@ -31,6 +32,15 @@ PENDULUM = """
 """.replace("<joint axis", '<joint name="joint" axis', 1)
 """Two links, of which the second touches the floor."""
 FREE_BODY = '<mujoco><worldbody><body><freejoint/><geom type="sphere" size=".1"/></body></worldbody></mujoco>'
+BODY_ON_A_FLOOR = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="5 5 .1"/>
+    <body name="body" pos="0 0 .1"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+  </worldbody>
+  <sensor><contact name="feet" subtree1="body" reduce="{reduce}" data="{data}"/></sensor>
+</mujoco>
+"""
 
 
 @pytest.mark.parametrize("name", ["spatial_tendon", "force_sensors_rk4"])
@@ -95,6 +105,11 @@ def test_an_array_is_accepted_or_refused_in_one_line(engine):
         ("jax", "floor", "qLD", "physics=jax does not return mjData's 'qLD' as MuJoCo does; use physics=c"),
         ("jax", "floor", "ten_J", "physics=jax does not return mjData's 'ten_J' as MuJoCo does; use physics=warp or c"),
         ("warp", "floor", "energy", "physics=warp does not return mjData's 'energy' as MuJoCo does; use physics=c"),
+        # Wrong on a GPU only: there, threads race for the rows.
+        *(
+            ("warp", "humanoid", name, f"physics=warp does not return mjData's '{name}' as MuJoCo does; use physics=c")
+            for name in ("actuator_moment", "moment_rowadr", "moment_colind")
+        ),
         ("jax", "spatial_tendon", "cfrc_ext", "physics=jax leaves the forces of spatial tendons out of 'cfrc_ext'"),
         ("jax", "subtree_sensors_rk4", "subtree_linvel", "MJX computes sensors at another stage of RK4"),
         ("warp", "force_sensors_rk4", "sensordata", "MJX computes sensors at another stage of RK4"),
@@ -117,3 +132,15 @@ def test_refusals(engine, model, name, says):
 def test_sensors_are_refused_where_the_task_reads_them(engine, kind, says):
     with pytest.raises(UserError, match=says):
         make_engine(engine, sensors("jointpos", kind), 1, ("sensordata",))
+
+
+def test_warp_refuses_contact_sensors_whose_order_is_left_to_chance():
+    def read(engine, reduce, data):
+        model = mujoco.MjModel.from_xml_string(BODY_ON_A_FLOOR.format(reduce=reduce, data=data))
+        refuse_derived(model, engine, ("sensordata",))
+
+    read("c", "none", "found force")
+    with pytest.raises(UserError, match="contacts of sensor 'feet' in no fixed order; set its reduce"):
+        read("warp", "none", "found force")
+    for reduce, data in (("none", "found"), ("maxforce", "force"), ("netforce", "force")):
+        read("warp", reduce, data)
