@@ -25,12 +25,12 @@ _EVERY = {
     *("qacc", "act", "act_dot", "userdata", "xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis"),
     *("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "subtree_com", "cdof", "cinert"),
     *("crb", "ten_length", "ten_velocity", "actuator_length", "actuator_velocity", "actuator_force", "cvel"),
-    *("cdof_dot", "qfrc_bias", "qfrc_gravcomp", "qfrc_fluid", "qfrc_passive", "qfrc_actuator", "qfrc_smooth"),
+    *("cdof_dot", "qfrc_bias", "qfrc_gravcomp", "qfrc_passive", "qfrc_actuator", "qfrc_smooth"),
     *("qacc_smooth", "qfrc_constraint", *LATE_ARRAYS, *_SENSOR_ARRAYS),
 }
 _NOT_JAX = {
     *("M", "qfrc_spring", "qfrc_damper", "qfrc_adhesion", "light_xpos", "light_xdir", "ten_J", "ten_wrapadr"),
-    *("ten_wrapnum", "moment_rownnz"),
+    *("ten_wrapnum", "moment_rownnz", "qfrc_fluid"),
 }
 _ORDERED_BY_CHANCE = {"actuator_moment", "moment_rowadr", "moment_colind"}
 """Sparse rows that Warp's threads on a GPU place in the order in which they get there."""

@@ -104,6 +104,10 @@ def test_an_array_is_accepted_or_refused_in_one_line(engine):
         ("c", "floor", "xpo", "mjData has no array 'xpo' (did you mean: xpos"),
         ("jax", "floor", "qLD", "physics=jax does not return mjData's 'qLD' as MuJoCo does; use physics=c"),
         ("jax", "floor", "ten_J", "physics=jax does not return mjData's 'ten_J' as MuJoCo does; use physics=warp or c"),
+        (
+            *("jax", "fluid", "qfrc_fluid"),
+            "physics=jax does not return mjData's 'qfrc_fluid' as MuJoCo does; use physics=warp or c",
+        ),
         ("warp", "floor", "energy", "physics=warp does not return mjData's 'energy' as MuJoCo does; use physics=c"),
         # Wrong on a GPU only: there, threads race for the rows.
         *(
