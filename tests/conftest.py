@@ -56,8 +56,10 @@ def pytest_terminal_summary(terminalreporter):
 
 
 def is_gpu_part(report):
-    """Whether a report is the outcome of a part of the GPU gate."""
-    return "gpu" in getattr(report, "keywords", ()) and (report.when == "call" or report.outcome != "passed")
+    """Whether it is a report, not a test that was left out, and the outcome of a part of the GPU gate."""
+    if not isinstance(report, pytest.TestReport):
+        return False
+    return "gpu" in report.keywords and (report.when == "call" or report.outcome != "passed")
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Campaigns of minutes, run by CI after the fast tests."""
+"""Campaigns of minutes. CI runs all but the long ones after the fast tests."""
 
 import json
 import signal
@@ -19,7 +19,11 @@ SHORTER = {
 
 @pytest.mark.parametrize(
     ("env", "algo", "least", "enough"),
-    [("inverted_pendulum", "ppo", 950, 999), ("walker2d", "td3", 400, 600), ("inverted_pendulum", "a2c", 950, 999)],
+    [
+        ("inverted_pendulum", "ppo", 950, 999),
+        pytest.param("inverted_pendulum", "a2c", 950, 999, marks=pytest.mark.long),
+        pytest.param("walker2d", "td3", 400, 600, marks=pytest.mark.long),
+    ],
 )
 def test_a_policy_is_good_after_the_cpu_recipe(tmp_path, env, algo, least, enough):
     """The command that a user without a GPU types, stopped by SIGTERM once an evaluation is clearly above the mark.
@@ -44,7 +48,10 @@ OWN = {
 }
 
 
-@pytest.mark.parametrize(("env", "algo", "physics"), [("walker2d", "ppo", "jax"), ("humanoid", "sac", "warp")])
+@pytest.mark.parametrize(
+    ("env", "algo", "physics"),
+    [("walker2d", "ppo", "jax"), pytest.param("humanoid", "sac", "warp", marks=pytest.mark.long)],
+)
 def test_training_through_mjx(tmp_path, env, algo, physics):
     """A small batch, from the command to the score, on each MJX engine. `jax` takes minutes to compile a humanoid."""
     small = ("num_envs=16", "evaluation.num_envs=2", "total_steps=1024", "algo.unroll_length=16")

@@ -58,7 +58,7 @@ def test_own_robot_trains_and_plays(tmp_path, capsys):
 
 @needs_dm_control
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["jax", "warp"])
+@pytest.mark.parametrize("engine", [pytest.param("jax", marks=pytest.mark.long), "warp"])
 def test_own_robot_trains_on_mjx(engine, tmp_path):
     run = train_robot(tmp_path, f"physics={engine}", "evaluation.gymnasium_episodes=1")
     scores = mjx_walk.load_run(run).evaluate(episodes=2)

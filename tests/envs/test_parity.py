@@ -37,7 +37,13 @@ FAST = [("humanoid", "v5", "warp"), ("half_cheetah", "v5", "jax")]
 EVERY = [(name, "v5", physics) for name in TASKS for physics in ("jax", "warp")]
 EVERY += [("walker2d", "v4", "warp")]
 """Every model; the older Walker2d's on Warp alone. The versions of the other tasks share theirs."""
-CASES = [*FAST, *(pytest.param(*case, marks=pytest.mark.slow) for case in EVERY if case not in FAST)]
+LONG = ("humanoid_standup", "v5", "jax")
+"""Its body is Humanoid's."""
+SLOW, SLOW_AND_LONG = [pytest.mark.slow], [pytest.mark.slow, pytest.mark.long]
+CASES = [
+    *FAST,
+    *(pytest.param(*case, marks=SLOW_AND_LONG if case == LONG else SLOW) for case in EVERY if case not in FAST),
+]
 
 
 @pytest.mark.parametrize(("name", "version", "physics"), CASES)

@@ -68,7 +68,9 @@ def scored_run(tmp_path_factory):
     return run_dir
 
 
-@pytest.mark.parametrize("physics", slow_except(["c"], ["c", "jax", "warp"]))
+@pytest.mark.parametrize(
+    "physics", [*slow_except(["c"], ["c", "warp"]), pytest.param("jax", marks=[pytest.mark.slow, pytest.mark.long])]
+)
 def test_n_and_n_calls_equal_2n(tmp_path, physics, six_calls):
     train_here(tmp_path / "halves", TASK[physics], f"physics={physics}", f"total_steps={3 * TINY_CALL}")
     train(tmp_path / "halves", "resume=true", f"total_steps={6 * TINY_CALL}", tiny=[])
