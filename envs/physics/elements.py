@@ -23,10 +23,15 @@ def named(
 
     def users(model: mujoco.MjModel) -> Iterator[str]:
         for i in np.flatnonzero(is_user(model)):
-            name = getattr(model, kind)(int(i)).name
-            yield f"{_SPOKEN.get(kind, kind)} '{name}'" if name else f"{_SPOKEN.get(kind, kind)} {i}"
+            yield name_of(model, kind, int(i))
 
     return users
+
+
+def name_of(model: mujoco.MjModel, kind: str, index: int) -> str:
+    """An element as `kind 'name'`, or with its index if it has no name."""
+    name = getattr(model, kind)(index).name
+    return f"{_SPOKEN.get(kind, kind)} '{name}'" if name else f"{_SPOKEN.get(kind, kind)} {index}"
 
 
 def option(
@@ -114,13 +119,13 @@ def slippery_contacts(model: mujoco.MjModel) -> Iterator[str]:
     """
     if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
         return
-    for geoms, pair in _pairs_that_move(model):
+    for geoms, pair in pairs_that_move(model):
         condim, friction = _contact_friction(model, geoms, pair)
         if condim > 1 and friction < LEAST_PYRAMIDAL_FRICTION:
             yield "geoms " + " and ".join(f"'{model.geom(int(geom)).name or geom}'" for geom in geoms)
 
 
-def _pairs_that_move(model: mujoco.MjModel) -> Iterator[tuple[list[int], int]]:
+def pairs_that_move(model: mujoco.MjModel) -> Iterator[tuple[list[int], int]]:
     """Pairs of geoms that may touch, of which at least one moves, and the index of their `<pair>`, or -1."""
     from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
     from mujoco.mjx._src import collision_driver
@@ -171,6 +176,46 @@ def _is_chain(model: mujoco.MjModel, dofs: Shaped[np.ndarray, " n"]) -> bool:
 def balanced_bodies(model: mujoco.MjModel) -> Shaped[np.ndarray, " bodies"]:
     """Moving bodies with contacts whose centre of mass no joint moves. MJX's solver divides by their inertia, zero."""
     collides = np.zeros(model.nbody, bool)
-    for geoms, _ in _pairs_that_move(model):
+    for geoms, _ in pairs_that_move(model):
         collides[model.geom_bodyid[geoms]] = True
     return _moving_bodies(model) & collides & (model.body_invweight0[:, 0] < mujoco.mjMINVAL)
+
+
+def motors_limited_twice(model: mujoco.MjModel) -> Shaped[np.ndarray, " motors"]:
+    """Motors with a limit on their own force, of several on a tendon that limits their sum."""
+    on_tendon = model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON
+    tendon = np.where(on_tendon, model.actuator_trnid[:, 0], 0)
+    num_motors = np.bincount(tendon[on_tendon], minlength=max(model.ntendon, 1))
+    is_limited = model.tendon_actfrclimited.astype(bool) if model.ntendon else np.zeros(1, bool)
+    return on_tendon & model.actuator_forcelimited.astype(bool) & is_limited[tendon] & (num_motors[tendon] > 1)
+
+
+def user_motors(model: mujoco.MjModel) -> Shaped[np.ndarray, " motors"]:
+    """Motors whose force a callback gives. Without one, MuJoCo has a gain of one, MJX of zero."""
+    return (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_USER) | (
+        model.actuator_biastype == mujoco.mjtBias.mjBIAS_USER
+    )
+
+
+def negative_joints(model: mujoco.MjModel) -> Shaped[np.ndarray, " joints"]:
+    """Joints with negative damping or friction, which MuJoCo accepts."""
+    is_negative = np.zeros(model.njnt, bool)
+    is_negative[model.dof_jntid[(model.dof_damping < 0) | (model.dof_frictionloss < 0)]] = True
+    return is_negative
+
+
+def negative_tendons(model: mujoco.MjModel) -> Shaped[np.ndarray, " tendons"]:
+    """Tendons with negative damping or friction."""
+    return (model.tendon_damping < 0) | (model.tendon_frictionloss < 0)
+
+
+def side_sites_elsewhere(model: mujoco.MjModel) -> Shaped[np.ndarray, " tendons"]:
+    """Tendons around a geom whose side site is on another body. MJX compares their positions within their bodies."""
+    is_geom = np.isin(model.wrap_type, (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER))
+    wraps = np.flatnonzero(is_geom & (model.wrap_prm >= 0))
+    sites, geoms = model.wrap_prm[wraps].astype(int), model.wrap_objid[wraps]
+    elsewhere = wraps[model.site_bodyid[sites] != model.geom_bodyid[geoms]]
+    first = model.tendon_adr
+    return np.array(
+        [np.any((elsewhere >= a) & (elsewhere < a + n)) for a, n in zip(first, model.tendon_num, strict=True)], bool
+    )

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from mujoco import mjx
 from mujoco.mjx._src import forward as mjx_forward
 from mujoco.mjx._src import scan as mjx_scan
+from mujoco.mjx._src import sensor as mjx_sensor
 from mujoco.mjx._src import smooth as mjx_smooth
 
 from mjx_walk.envs.physics import capsule_frames_jax, static_pairs
@@ -59,7 +60,7 @@ class JaxEngine:
     def forward(self, state: PhysicsState) -> Derived:
         """See `Engine.forward`."""
         with jax.default_matmul_precision("highest"):
-            data = mjx.forward(self._model, self._data(state))
+            data = _forward(self._model, self._data(state))
         return read_derived(data.replace(qpos=state.qpos), self._derived)  # MJX normalizes its quaternions
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> tuple[PhysicsState, Derived, Bool[Array, ""]]:
@@ -73,6 +74,16 @@ class JaxEngine:
         return state, read_derived(data, self._derived), jnp.zeros((), bool)
 
 
+def _forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.forward`, which leaves out the sensors of accelerations where a model has no constraint.
+
+    Where constraints are disabled, MJX cannot compute them; a task cannot read them then.
+    """
+    data = mjx_forward.forward(model, data)
+    is_left_out = data._impl.efc_J.size == 0 and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    return mjx_sensor.sensor_acc(model, data) if is_left_out else data
+
+
 def _euler(model: mjx.Model, start: mjx.Data) -> mjx.Data:
     """Advance by one substep with semi-implicit Euler and implicit joint damping. Source: MuJoCo's `mj_Euler`.
 
@@ -80,7 +91,7 @@ def _euler(model: mjx.Model, start: mjx.Data) -> mjx.Data:
     XLA's threads while it occupies one of them. On a CPU with two threads, two at the same time would wait for each
     other forever. The added zero makes the second one wait for the accelerations, which need the first.
     """
-    data = mjx_forward.forward(model, start)
+    data = _forward(model, start)
     if model.nv:
         data = data.tree_replace({"_impl.M": data._impl.M + 0.0 * data.qacc[0]})
     return mjx_forward.euler(model, data)
@@ -98,7 +109,7 @@ def _runge_kutta_4(model: mjx.Model, start: mjx.Data) -> mjx.Data:
         step, weight = coefficients
         qpos = jnp.where(step == 0, start.qpos, _integrate_position(model, start.qpos, step * velocity))
         velocity = start.qvel + step * data.qacc * dt
-        data = mjx.forward(model, data.replace(qpos=qpos, qvel=velocity))
+        data = _forward(model, data.replace(qpos=qpos, qvel=velocity))
         return (data, velocity, velocity_sum + weight * velocity, acceleration_sum + weight * data.qacc), None
 
     zeros = jnp.zeros_like(start.qvel)

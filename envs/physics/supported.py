@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import mujoco
 
-from mjx_walk.envs.physics import elements
+from mjx_walk.envs.physics import constraint_settings, elements
 from mjx_walk.utils.errors import UserError, first_line
 
 __all__ = ["refuse_unsupported", "unsupported_by_mjx", "warn_of_approximations"]
@@ -139,6 +139,48 @@ _FEATURES = (
         "remove them",
     ),
     _Feature(
+        _MJX,
+        constraint_settings.mixed_solrefs,
+        "a solref of one positive number, for which MuJoCo takes its default",
+        "make both numbers positive or both negative",
+    ),
+    _Feature(
+        _MJX,
+        elements.named("actuator", elements.user_motors),
+        "user gains and biases",
+        "use another gaintype or biastype",
+    ),
+    _Feature(
+        _MJX,
+        elements.named("joint", elements.negative_joints),
+        "negative damping and friction",
+        "set damping and frictionloss to zero or more",
+    ),
+    _Feature(
+        _MJX,
+        elements.named("tendon", elements.negative_tendons),
+        "negative damping and friction",
+        "set damping and frictionloss to zero or more",
+    ),
+    _Feature(
+        ("warp",),
+        elements.named("actuator", elements.motors_limited_twice),
+        "limits of single motors on a tendon that limits their sum",
+        "remove forcerange from the motors, or actuatorfrcrange from the tendon",
+    ),
+    _Feature(
+        ("jax",),
+        constraint_settings.solimps_without_width,
+        "a solimp of width zero as MuJoCo does",
+        "set its third number to more than zero",
+    ),
+    _Feature(
+        ("jax",),
+        elements.named("tendon", elements.side_sites_elsewhere),
+        "a sidesite on another body than its geom",
+        "move the site to the geom's body",
+    ),
+    _Feature(
         ("jax",),
         elements.named("actuator", lambda m: elements.any_of(m.actuator_damping, m.actuator_dampingpoly)),
         "actuator damping",
@@ -197,7 +239,7 @@ _FEATURES = (
 _Geom = mujoco.mjtGeom
 _AS_IN_MUJOCO = {
     *((_Geom.mjGEOM_PLANE, other) for other in (_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_CAPSULE)),
-    *((_Geom.mjGEOM_PLANE, other) for other in (_Geom.mjGEOM_ELLIPSOID, _Geom.mjGEOM_CYLINDER)),
+    (_Geom.mjGEOM_PLANE, _Geom.mjGEOM_ELLIPSOID),
     *((_Geom.mjGEOM_SPHERE, other) for other in (_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_BOX)),
     (_Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_CAPSULE),
 }

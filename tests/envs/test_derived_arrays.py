@@ -31,6 +31,17 @@ PENDULUM = """
 </mujoco>
 """.replace("<joint axis", '<joint name="joint" axis', 1)
 """Two links, of which the second touches the floor."""
+HINGE = """
+<mujoco>
+  <worldbody>
+    <body pos="0 0 1">
+      <joint name="joint" axis="0 1 0"/><geom size=".1" pos=".2 0 0"/><site name="tip" pos=".2 0 0"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="joint" ctrlrange="-1 1"/></actuator>
+  <sensor><accelerometer site="tip"/><force site="tip"/><torque site="tip"/></sensor>
+</mujoco>
+"""
 FREE_BODY = '<mujoco><worldbody><body><freejoint/><geom type="sphere" size=".1"/></body></worldbody></mujoco>'
 BODY_ON_A_FLOOR = """
 <mujoco>
@@ -123,6 +134,22 @@ def test_refusals(engine, model, name, says):
     with pytest.raises(UserError) as refused:
         make_engine(engine, MODELS[model](), 1, ("xpos", name))
     assert says in str(refused.value) and f"the task names '{name}' in derived_names" in str(refused.value)
+
+
+def test_jax_refuses_late_arrays_without_constraints():
+    model = mujoco.MjModel.from_xml_string(PENDULUM.format(option="", sensor=""))
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    refuse_derived(model, "jax", ("xpos",))
+    with pytest.raises(UserError, match="does not compute 'cacc' without constraints; remove the flag"):
+        refuse_derived(model, "jax", ("cacc",))
+
+
+def test_sensors_of_accelerations_without_any_constraint():
+    """MJX leaves them out where the solver has nothing to do."""
+    model = mujoco.MjModel.from_xml_string(HINGE)
+    assert not mujoco.mjx.make_data(model)._impl.efc_J.size
+    found = errors(model, "jax", ("sensordata", "cacc", "cfrc_int"), reference_cases(model))
+    assert max(max(pair) for pair in found.values()) < TOLERANCE["jax"]
 
 
 @pytest.mark.parametrize(

@@ -91,6 +91,52 @@ REFUSED = {
         {"world": '<body name="wheel" pos="2 0 .1"><joint axis="0 1 0"/><geom size=".12"/></body>'},
         "contacts of a body whose joints only turn it about its center of mass (body 'wheel')",
     ),
+    "mixed_contact": (MJX, {"shin": 'solref="-1000 1"'}, "a solref of one positive number"),
+    "mixed_contact_without_damping": (MJX, {"torso": f'{SPHERE} solref=".02 0"'}, "takes its default (geom 'torso')"),
+    "mixed_pair": (
+        MJX,
+        {"contact": '<pair name="p" geom1="floor" geom2="torso" solreffriction="-100 1"/>'},
+        "takes its default (contact pair 'p')",
+    ),
+    "mixed_limit": (MJX, {"knee": 'range="-30 30" solreflimit=".02 -5"'}, "takes its default (joint 'knee')"),
+    "mixed_friction": (MJX, {"knee": 'frictionloss="1" solreffriction="-100 1"'}, "takes its default (joint 'knee')"),
+    "mixed_tendon_limit": (
+        MJX,
+        {"tendon": FIXED.format('range="-.1 .1" solreflimit="-500 1"')},
+        "takes its default (tendon 't')",
+    ),
+    "mixed_equality": (
+        MJX,
+        {"equality": '<joint name="e" joint1="knee" joint2="hinge" solref=".02 -1"/>'},
+        "takes its default (equality constraint 'e')",
+    ),
+    "user_gain": (MJX, {"motor": GENERAL.format('gaintype="user"')}, "user gains and biases (motor 'm')"),
+    "user_bias": (MJX, {"motor": GENERAL.format('biastype="user"')}, "user gains and biases (motor 'm')"),
+    "negative_damping": (MJX, {"knee": 'damping="-.5"'}, "negative damping and friction (joint 'knee')"),
+    "negative_friction": (MJX, {"knee": 'frictionloss="-.1"'}, "negative damping and friction (joint 'knee')"),
+    "negative_tendon_damping": (MJX, {"tendon": FIXED.format('damping="-.5"')}, "and friction (tendon 't')"),
+    "limited_twice": (
+        WARP,
+        {
+            "tendon": FIXED.format('actuatorfrcrange="-1 1"'),
+            "motor": '<motor name="m" tendon="t" forcerange="-.5 .5"/><motor tendon="t"/>',
+        },
+        "limits of single motors on a tendon that limits their sum (motor 'm')",
+    ),
+    "no_width": (JAX, {"shin": 'solimp=".3 .9 0"'}, "a solimp of width zero as MuJoCo does (geom 'shin')"),
+    "no_width_of_a_limit": (
+        JAX,
+        {"knee": 'range="-30 30" solimplimit=".3 .9 0"'},
+        "a solimp of width zero as MuJoCo does (joint 'knee')",
+    ),
+    "side_site": (
+        JAX,
+        {
+            "world": '<geom name="reel" type="cylinder" size=".05 .1" pos="0 0 2"/>',
+            "tendon": SPATIAL.format("").replace("/><", '/><geom geom="reel" sidesite="tip"/><', 1),
+        },
+        "a sidesite on another body than its geom (tendon 't')",
+    ),
     "static_tendon": (
         MJX,
         {
