@@ -16,13 +16,13 @@ __all__ = ["ASSETS", "absolute_xml_file", "is_asset", "model_path", "source_hash
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 """Gymnasium's models."""
 
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _ATTRIBUTE = re.compile(r"""([\w:.-]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
-_TAG = re.compile(r"""<([\w:.-]+)((?:[^<>"']|"[^"]*"|'[^']*')*)>""")
+_TAG = re.compile(r"""<!--.*?-->|<([\w:.-]+)((?:[^<>"']|"[^"]*"|'[^']*')*)>""", re.DOTALL)
+"""A comment, or a tag and its attributes."""
 _FILE = re.compile("file(name|right|left|up|down|front|back)?")
 """Attributes that name a file."""
 _FOLDERS = {"mesh": "meshdir", "flexcomp": "meshdir", "texture": "texturedir"}
-"""The compiler's attribute for the folder of an element's file; `assetdir` for other elements."""
+"""The compiler's attribute for the folder of an element's file."""
 
 
 def model_path(xml_file: str) -> Path:
@@ -84,26 +84,34 @@ def _find_sources(root: Path, name: str, found: dict[str, None]) -> None:
     folder = os.path.dirname(name)
     tags: list[tuple[str, str, dict[str, str]]] = []
     _read_tags(root, folder, name, tags, found)
-    compiler: dict[str, str] = {}
-    for _, tag, attributes in tags:
-        compiler |= attributes if tag == "compiler" else {}
-    is_stripped = compiler.get("strippath") == "true" or any(tag == "robot" for _, tag, _ in tags)
+    compiler = _compiler_settings(tags)
+    is_stripped = compiler.get("strippath") == "true"
     for place, tag, attributes in tags:
         if tag in ("include", "compiler"):
             continue
-        shared = compiler.get("assetdir", "")
-        searched = os.path.join(folder, compiler.get(_FOLDERS.get(tag, ""), shared))
-        opened = os.path.join(folder, compiler.get("texturedir" if tag == "texture" else "meshdir", shared))
+        searched = os.path.join(folder, compiler.get(_FOLDERS.get(tag, "assetdir"), ""))
+        opened = os.path.join(folder, compiler.get("texturedir" if tag == "texture" else "meshdir", ""))
         for value in (value for key, value in attributes.items() if _FILE.fullmatch(key)):
             if tag == "model":
                 submodel = _first_file(root, (folder, place), value)
                 if submodel:
                     _find_sources(root, submodel, found)
                 continue
+            value = value.replace("\\", "/")
             asset = os.path.basename(value) if is_stripped else value.removeprefix("package://")
             is_beside = place != folder and not (root / searched / asset).is_file()  # beside an included file
             source = _first_file(root, ([place] if is_beside else []) + [opened, searched, folder], asset)
             found |= {source: None} if source else {}
+
+
+def _compiler_settings(tags: Iterable[tuple[str, str, dict[str, str]]]) -> dict[str, str]:
+    """Attributes of all `<compiler>`, the last ones. `assetdir` replaces the other folders of earlier ones."""
+    settings: dict[str, str] = {}
+    for _, tag, attributes in tags:
+        if tag == "compiler" and "assetdir" in attributes:
+            settings |= dict.fromkeys(("meshdir", "texturedir"), attributes["assetdir"])
+        settings |= attributes if tag == "compiler" else {}
+    return {key: value.replace("\\", "/") if key.endswith("dir") else value for key, value in settings.items()}
 
 
 def _read_tags(
@@ -115,8 +123,8 @@ def _read_tags(
     """
     found[name] = None
     place = os.path.dirname(name)
-    text = _COMMENT.sub("", (root / name).read_bytes().decode("utf-8", "surrogateescape"))
-    for tag, content in _TAG.findall(text):
+    text = (root / name).read_bytes().decode("utf-8", "surrogateescape")
+    for tag, content in _TAG.findall(text):  # with comments, whose tag is empty
         attributes = {key: html.unescape(double or single) for key, double, single in _ATTRIBUTE.findall(content)}
         tags.append((place, tag, attributes))
         if tag == "include" and "file" in attributes:
@@ -127,5 +135,6 @@ def _read_tags(
 
 def _first_file(root: Path, folders: Iterable[str], name: str) -> str | None:
     """The first of the folders' files of a name that exists."""
+    name = name.replace("\\", "/")  # MuJoCo takes both
     names = (os.path.normpath(os.path.join(folder, name)) for folder in folders)
     return next((found for found in names if (root / found).is_file()), None)

@@ -70,10 +70,60 @@ def test_a_task_keeps_its_files_when_the_working_directory_changes(tmp_path, mon
     assert env.reset(seed=0)[0].shape == (11,)
 
 
+def needed_files(folder):
+    """The files of a folder without which MuJoCo cannot read the folder's `robot.xml`."""
+    needed = set()
+    for path in [path for path in folder.rglob("*") if path.is_file()]:
+        content = path.read_bytes()
+        path.unlink()
+        try:
+            load_model(str(folder / "robot.xml"))
+        except UserError:
+            needed.add(str(path.relative_to(folder)))
+        path.write_bytes(content)
+    return needed
+
+
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+BODY = '<worldbody><body><joint/><geom type="mesh" mesh="m"/></body></worldbody>'
+ODD = {
+    "backslashes": (
+        f'<mujoco><compiler meshdir="d\\q"/><include file="a\\b.xml"/>{BODY}</mujoco>',
+        {"a/b.xml": '<mujoco><asset><mesh name="m" file="r\\m.obj"/></asset></mujoco>', "d/q/r/m.obj": TETRAHEDRON},
+    ),
+    "later assetdir": (
+        '<mujoco><compiler meshdir="q"/><compiler assetdir="d"/><asset><mesh name="m" file="m.obj"/></asset>'
+        f"{BODY}</mujoco>",
+        {"q/m.obj": "not read", "d/m.obj": TETRAHEDRON},
+    ),
+    "comment sign in a name": (
+        f'<mujoco model="<!--"><include file="b.xml"/>{BODY}<!-- --></mujoco>',
+        {"b.xml": '<mujoco><asset><mesh name="m" file="m.obj"/></asset></mujoco>', "m.obj": TETRAHEDRON},
+    ),
+    "urdf": (
+        '<robot name="r"><mujoco><compiler strippath="false"/></mujoco><link name="base"><inertial><mass value="1"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry>'
+        '<mesh filename="q/m.obj"/></geometry></collision></link><link name="arm"><inertial><mass value="1"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        '<joint name="j" type="continuous"><parent link="base"/><child link="arm"/></joint></robot>',
+        {"q/m.obj": TETRAHEDRON, "m.obj": "not read"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_odd_names_of_files_are_sources(name, tmp_path):
+    text, files = ODD[name]
+    for path, content in {"robot.xml": text, **files}.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(content)
+    assert source_hashes(str(tmp_path / "robot.xml")).keys() == needed_files(tmp_path)
+    assert len(needed_files(tmp_path)) >= 2
+
+
 @pytest.fixture
 def robot(tmp_path):
     """A model of several files: nested includes, assets in the compiler's folders, and a submodel with its own."""
-    tetrahedron = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
     texts = {
         "robot.xml": (
             '<mujoco><!-- <include file="unused.xml"/> --><compiler meshdir="./meshes" texturedir="pictures"/>'
@@ -87,12 +137,12 @@ def robot(tmp_path):
             "<mujoco><asset><mesh name='torso' file='torso.obj'/><texture name='skin' type='2d' file='skin.png'/>"
             '<hfield name="ground" file="ground.png" size="1 1 1 1"/></asset></mujoco>'
         ),
-        "meshes/torso.obj": tetrahedron,
+        "meshes/torso.obj": TETRAHEDRON,
         "arm/arm.xml": (
             '<mujoco><compiler assetdir="."/><asset><mesh name="hand" file="hand.obj"/></asset><worldbody>'
             '<body name="upper"><joint/><geom type="mesh" mesh="hand"/></body></worldbody></mujoco>'
         ),
-        "arm/hand.obj": tetrahedron,
+        "arm/hand.obj": TETRAHEDRON,
         "unused.xml": "<mujoco/>",
         "torso.obj": "not read",
     }
@@ -111,15 +161,7 @@ def test_every_file_that_mujoco_reads_is_a_source(robot):
     model = str(robot / "robot.xml")
     load_model(model)
     found = source_hashes(model)
-    needed = set()
-    for path in [path for path in robot.rglob("*") if path.is_file()]:
-        content = path.read_bytes()
-        path.unlink()
-        try:
-            load_model(model)
-        except UserError:
-            needed.add(str(path.relative_to(robot)))
-        path.write_bytes(content)
+    needed = needed_files(robot)
     assert found.keys() == needed and len(needed) == 8
     for name in needed:
         content = (robot / name).read_bytes()
