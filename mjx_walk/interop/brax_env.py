@@ -1,10 +1,13 @@
 """A task as a `brax.envs.Env`, for Brax's wrappers and trainers and for algorithms written against them."""
 
 import dataclasses
+import operator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 from brax.base import System
 from brax.envs import base
 from brax.io import mjcf
@@ -38,6 +41,16 @@ _INSTEAD = {
     "actuator.force_range": "actuator_forcerange",
 }
 """What MJX reads instead of the values of Brax's own engines."""
+_SWITCHED_OFF = {
+    "opt.density": "opt.density opt.viscosity opt.wind",
+    "opt.viscosity": "opt.density opt.viscosity opt.wind",
+    "opt.wind": "opt.density opt.viscosity opt.wind",
+    "dof_frictionloss": "dof_frictionloss",
+    "tendon_frictionloss": "tendon_frictionloss",
+    "body_gravcomp": "body_gravcomp",
+    "tendon_armature": "tendon_armature",
+}
+"""Arrays that MJX reads only if one of these has a value in the model as it is loaded."""
 
 
 class BraxEnv(base.Env):
@@ -95,6 +108,7 @@ class BraxEnv(base.Env):
         if not changes:
             return
         _check_changes(changes, {_dotted(path): leaf for path, leaf in own.items()})
+        _check_switches(changes, self._task.model)
         self._change_model(changes)
         self._changed_sys = sys
 
@@ -158,6 +172,20 @@ def _check_changes(changes: dict[str, jax.Array], own: dict[str, jax.Array]) -> 
         if name not in own or jnp.shape(value) != jnp.shape(own[name]):
             expected = f"has shape {jnp.shape(own[name])}" if name in own else "does not exist"
             raise UserError(f"'{name}' of this model {expected}, not {jnp.shape(value)}; keep the shape of each array")
+
+
+def _check_switches(changes: dict[str, jax.Array], model: mujoco.MjModel) -> None:
+    """Check that MJX computes what has changed. It leaves out what a model does not have when it is loaded.
+
+    Raises:
+        UserError: it does not.
+    """
+    for name in changes.keys() & _SWITCHED_OFF.keys():
+        needed = _SWITCHED_OFF[name].split()
+        if not any(np.any(operator.attrgetter(array)(model)) for array in needed):
+            raise UserError(
+                f"the model has no {' or '.join(needed)}, so that MJX does not read '{name}'; give it a value"
+            )
 
 
 def _dotted(path: tuple[Any, ...]) -> str:

@@ -92,6 +92,20 @@ def test_randomization_that_the_physics_does_not_read(name, advice):
         env.sys = env.sys.replace(body_mass=jnp.ones(1))
 
 
+def doubled(env, name):
+    return env.sys.tree_replace({name: 2 * operator.attrgetter(name)(env.sys) + 1})
+
+
+@pytest.mark.parametrize("name", ["opt.density", "opt.wind", "dof_frictionloss", "body_gravcomp"])
+def test_randomization_of_what_the_model_does_not_have(name):
+    env = BraxEnv("inverted_pendulum", physics="jax")
+    with pytest.raises(UserError, match=f"MJX does not read '{name}'; give it a value"):
+        env.sys = doubled(env, name)
+    in_a_medium = BraxEnv("swimmer", physics="jax")
+    for changed in ("opt.density", "opt.wind", "dof_damping"):
+        in_a_medium.sys = doubled(in_a_medium, changed)
+
+
 @pytest.mark.slow
 def test_domain_randomization():
     """The environment with the model's own masses steps as without the wrapper, the others differ."""
