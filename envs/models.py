@@ -12,7 +12,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_walk.envs.model_files import ASSETS, model_path
+from mjx_walk.envs.model_files import ASSETS, model_path, source_hashes
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.quiet_mujoco import hide_deprecations, write_no_log
@@ -85,6 +85,31 @@ def _has_enough_memory(model: mujoco.MjModel) -> bool:
     except (mujoco.FatalError, ValueError):
         return False
     return not data.warning.number[_LOST].any()
+
+
+def load_with_sources(xml_file: str) -> tuple[mujoco.MjModel, dict[str, str]]:
+    """Load a model, and hash the files that MuJoCo reads for it, for `warn_of_changed_sources`. See `load_model`."""
+    model = load_model(xml_file)
+    return model, source_hashes(xml_file)
+
+
+def warn_of_changed_sources(xml_file: str, sources: dict[str, str]) -> None:
+    """Log a warning if Gymnasium, which reads a model's files again, reads another model.
+
+    Args:
+        xml_file: name of one of Gymnasium's assets, or a path.
+        sources: the hashes when the model was loaded.
+
+    Raises:
+        UserError: the model file is gone.
+    """
+    path = model_path(xml_file)
+    if not path.is_file():
+        raise UserError(f"model file {path} is gone, and Gymnasium reads it again; restore it")
+    present = source_hashes(xml_file)
+    changed = [name for name in {**sources, **present} if sources.get(name) != present.get(name)]
+    if changed:
+        _LOGGER.warning("%s has changed since it was loaded; Gymnasium plays it as it is now", path.parent / changed[0])
 
 
 def _not_found(xml_file: str, path: Path) -> str:

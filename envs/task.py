@@ -73,7 +73,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         self.options = options = with_absolute_paths(options, Path.cwd())
         self.max_episode_steps = options.max_episode_steps
         self.model_file = options.xml_file or self.XML_FILES[options.version]
-        self.model = models.load_model(self.model_file)
+        self.model, self.model_sources = models.load_with_sources(self.model_file)
         self.body_ids = {body: models.body_id(self.model, body) for body in self.named_bodies()}
         models.check_model(self.model, options.name, self.MODEL_NEEDS)
         if options.xml_file:

@@ -13,6 +13,7 @@ import numpy as np
 
 from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
+from mjx_walk.envs.models import warn_of_changed_sources
 from mjx_walk.evaluation.gymnasium_worker import send
 from mjx_walk.runs.progress import ScoringProgress
 from mjx_walk.runs.scores import Scores
@@ -48,9 +49,13 @@ def score_in_gymnasium(task: Task, act: Callable[[Any], Any], num_episodes: int,
         act: a JAX function `[N, observation_size] f32 → [N, action_size] f32`, both in Gymnasium's units.
         num_episodes: N.
         seed: episode i is reset with `seed + i`. Seeds that differ by fewer than N share episodes.
+
+    Raises:
+        UserError: the model file is gone.
     """
     if not task.is_in_gymnasium:
         return score_in_sim(task, compile_episodes(task, lambda obs, key: act(obs)), num_episodes, seed)
+    warn_of_changed_sources(task.model_file, task.model_sources)
     seeds = [seed + i for i in range(num_episodes)]
     rounds = [seeds[i : i + _MAX_PARALLEL_EPISODES] for i in range(0, num_episodes, _MAX_PARALLEL_EPISODES)]
     with contextlib.closing(ScoringProgress(num_episodes, len(rounds) * task.max_episode_steps)) as progress:

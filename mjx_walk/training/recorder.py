@@ -12,7 +12,7 @@ from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium
 from mjx_walk.runs import checkpoint
 from mjx_walk.runs.background_saver import BackgroundSaver, Part
 from mjx_walk.runs.config import Config
-from mjx_walk.runs.inputs import changed_input, read_inputs, save_inputs
+from mjx_walk.runs.inputs import read_inputs, save_inputs
 from mjx_walk.runs.loggers import MetricsWriter, WandbLog
 from mjx_walk.runs.metrics import Row
 from mjx_walk.runs.policies import best_policy, deterministic_act, make_acting_algorithm
@@ -187,11 +187,6 @@ class Recorder:
         num_episodes = self.config.evaluation.gymnasium_episodes
         if not num_episodes or not self._policies:
             return {}
-        changed = changed_input(self._folder, self.config.env)
-        if changed:
-            _log.warning(
-                "%s has changed during the training; Gymnasium scores the policy with it as it is now", changed
-            )
         acting = make_acting_algorithm(self._task, self.config)
         scored: dict[str, tuple[Scores, int]] = {}
         blocks = {}

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from mjx_walk.envs import Task, View
+from mjx_walk.envs.models import warn_of_changed_sources
 from mjx_walk.envs.motors import torques_per_force
 from mjx_walk.utils.quiet_mujoco import hide_deprecations
 from mjx_walk.viewing.rendering import choose_opengl
@@ -121,9 +122,13 @@ def make_gymnasium(task: Task, **keywords: Any) -> gymnasium.Env:
     """Make the real Gymnasium environment of a task, with further keywords of `gymnasium.make`.
 
     A task without an equivalent in Gymnasium runs in its own engine.
+
+    Raises:
+        UserError: the model file is gone.
     """
     if not task.is_in_gymnasium:
         return TaskEnv(task, **keywords)
+    warn_of_changed_sources(task.model_file, task.model_sources)
     options = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
     with hide_deprecations(), warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4

@@ -13,8 +13,10 @@ from gymnasium.envs.mujoco.mujoco_env import expand_model_path
 from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.model_files import source_hashes
 from mjx_walk.envs.models import load_model
+from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium
 from mjx_walk.runs.config import load_config
 from mjx_walk.utils.errors import UserError
+from mjx_walk.viewing.episode import make_gymnasium
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
@@ -170,3 +172,18 @@ def test_every_file_that_mujoco_reads_is_a_source(robot):
         (robot / name).write_bytes(content)
     assert source_hashes(model) == found
     assert source_hashes("ant.xml").keys() == {"ant.xml"}
+
+
+def test_gymnasium_that_reads_another_model_than_the_task_is_reported(tmp_path, caplog):
+    path = tmp_path / "pole.xml"
+    path.write_bytes((ASSETS / "inverted_pendulum.xml").read_bytes())
+    task = make_env("inverted_pendulum", "c", xml_file=str(path))
+    make_gymnasium(task).close()
+    assert not caplog.records
+    path.write_text(path.read_text().replace("-9.81", "-9"))
+    make_gymnasium(task).close()
+    assert f"{path} has changed since it was loaded; Gymnasium plays it as it is now" in caplog.text
+    path.unlink()
+    for reads_it in (make_gymnasium, lambda task: score_in_gymnasium(task, lambda obs: obs[:, :1], 1)):
+        with pytest.raises(UserError, match="is gone, and Gymnasium reads it again; restore it"):
+            reads_it(task)
