@@ -4,14 +4,14 @@ import hashlib
 import html
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import gymnasium
 
 from mjx_walk.utils.files import open_to_read, user_path
 
-__all__ = ["ASSETS", "absolute_xml_file", "is_asset", "model_path", "source_hashes"]
+__all__ = ["ASSETS", "absolute_xml_file", "changed_names", "is_asset", "model_path", "source_hashes"]
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 """Gymnasium's models."""
@@ -72,6 +72,11 @@ def source_hashes(model_file: str) -> dict[str, str]:
     return {name: _hash(path.parent / name) for name in names}
 
 
+def changed_names(before: Mapping[str, str], present: Mapping[str, str]) -> list[str]:
+    """Names of files whose hashes differ, or that one of both lacks."""
+    return [name for name in {**before, **present} if before.get(name) != present.get(name)]
+
+
 def _hash(path: Path) -> str:
     with open_to_read(path) as file:
         return hashlib.sha256(file.read()).hexdigest()
@@ -97,7 +102,6 @@ def _find_sources(root: Path, name: str, found: dict[str, None]) -> None:
                 if submodel:
                     _find_sources(root, submodel, found)
                 continue
-            value = value.replace("\\", "/")
             asset = os.path.basename(value) if is_stripped else value.removeprefix("package://")
             is_beside = place != folder and not (root / searched / asset).is_file()  # beside an included file
             source = _first_file(root, ([place] if is_beside else []) + [opened, searched, folder], asset)
@@ -111,7 +115,7 @@ def _compiler_settings(tags: Iterable[tuple[str, str, dict[str, str]]]) -> dict[
         if tag == "compiler" and "assetdir" in attributes:
             settings |= dict.fromkeys(("meshdir", "texturedir"), attributes["assetdir"])
         settings |= attributes if tag == "compiler" else {}
-    return {key: value.replace("\\", "/") if key.endswith("dir") else value for key, value in settings.items()}
+    return settings
 
 
 def _read_tags(
@@ -125,7 +129,10 @@ def _read_tags(
     place = os.path.dirname(name)
     text = (root / name).read_bytes().decode("utf-8", "surrogateescape")
     for tag, content in _TAG.findall(text):  # with comments, whose tag is empty
-        attributes = {key: html.unescape(double or single) for key, double, single in _ATTRIBUTE.findall(content)}
+        attributes = {
+            key: html.unescape(double or single).replace("\\", "/")  # MuJoCo takes both for a separator
+            for key, double, single in _ATTRIBUTE.findall(content)
+        }
         tags.append((place, tag, attributes))
         if tag == "include" and "file" in attributes:
             source = _first_file(root, (folder, place), attributes["file"])
@@ -135,6 +142,5 @@ def _read_tags(
 
 def _first_file(root: Path, folders: Iterable[str], name: str) -> str | None:
     """The first of the folders' files of a name that exists."""
-    name = name.replace("\\", "/")  # MuJoCo takes both
     names = (os.path.normpath(os.path.join(folder, name)) for folder in folders)
     return next((found for found in names if (root / found).is_file()), None)

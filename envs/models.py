@@ -12,7 +12,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_walk.envs.model_files import ASSETS, model_path, source_hashes
+from mjx_walk.envs.model_files import ASSETS, changed_names, model_path, source_hashes
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.quiet_mujoco import hide_deprecations, write_no_log
@@ -106,8 +106,7 @@ def warn_of_changed_sources(xml_file: str, sources: dict[str, str]) -> None:
     path = model_path(xml_file)
     if not path.is_file():
         raise UserError(f"model file {path} is gone, and Gymnasium reads it again; restore it")
-    present = source_hashes(xml_file)
-    changed = [name for name in {**sources, **present} if sources.get(name) != present.get(name)]
+    changed = changed_names(sources, source_hashes(xml_file))
     if changed:
         _LOGGER.warning("%s has changed since it was loaded; Gymnasium plays it as it is now", path.parent / changed[0])
 

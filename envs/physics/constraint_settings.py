@@ -29,7 +29,7 @@ def _used(
     model: mujoco.MjModel,
 ) -> Iterator[tuple[str, int, Shaped[np.ndarray, " 2"], Shaped[np.ndarray, " 5"]]]:
     """Kind and index of each element that can make a constraint, with its `solref` and `solimp`."""
-    touching = [(geoms, pair) for geoms, pair in pairs_that_move(model)]
+    touching = list(pairs_that_move(model))
     for geom in sorted({int(geom) for geoms, pair in touching if pair < 0 for geom in geoms}):
         yield "geom", geom, model.geom_solref[geom], model.geom_solimp[geom]
     for pair in sorted({int(pair) for _, pair in touching if pair >= 0}):

@@ -131,7 +131,7 @@ def _sensors(
 
 
 def _keeps_every_contact(model: mujoco.MjModel) -> np.ndarray:
-    """For contact sensors: whether they list contacts as they come, and more of them than their number."""
+    """Contact sensors that list contacts in the order of `mjData`, and read more of them than how many there are."""
     fields, reduce, _ = model.sensor_intprm.T
     return (reduce == 0) & (fields != 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND))
 

@@ -75,9 +75,9 @@ class JaxEngine:
 
 
 def _forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.forward`, which leaves out the sensors of accelerations where a model has no constraint.
+    """`mjx.forward`, and the sensors of accelerations, which it leaves out for a model without constraints.
 
-    Where constraints are disabled, MJX cannot compute them; a task cannot read them then.
+    MJX cannot compute them where `<flag constraint>` is off. A task that reads them there is refused.
     """
     data = mjx_forward.forward(model, data)
     is_left_out = data._impl.efc_J.size == 0 and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT

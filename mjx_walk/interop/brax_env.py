@@ -41,16 +41,13 @@ _INSTEAD = {
     "actuator.force_range": "actuator_forcerange",
 }
 """What MJX reads instead of the values of Brax's own engines."""
-_SWITCHED_OFF = {
-    "opt.density": "opt.density opt.viscosity opt.wind",
-    "opt.viscosity": "opt.density opt.viscosity opt.wind",
-    "opt.wind": "opt.density opt.viscosity opt.wind",
-    "dof_frictionloss": "dof_frictionloss",
-    "tendon_frictionloss": "tendon_frictionloss",
-    "body_gravcomp": "body_gravcomp",
-    "tendon_armature": "tendon_armature",
-}
-"""Arrays that MJX reads only if one of these has a value in the model as it is loaded."""
+_READ_IF_ANY = (
+    ("opt.density", "opt.viscosity", "opt.wind"),
+    ("dof_frictionloss",),
+    ("tendon_frictionloss",),
+    ("body_gravcomp",),
+)
+"""Arrays that MJX reads only if at least one of the group is not zero in the model as it is loaded."""
 
 
 class BraxEnv(base.Env):
@@ -180,12 +177,10 @@ def _check_switches(changes: dict[str, jax.Array], model: mujoco.MjModel) -> Non
     Raises:
         UserError: it does not.
     """
-    for name in changes.keys() & _SWITCHED_OFF.keys():
-        needed = _SWITCHED_OFF[name].split()
-        if not any(np.any(operator.attrgetter(array)(model)) for array in needed):
-            raise UserError(
-                f"the model has no {' or '.join(needed)}, so that MJX does not read '{name}'; give it a value"
-            )
+    for group in _READ_IF_ANY:
+        is_read = any(np.any(operator.attrgetter(array)(model)) for array in group)
+        for name in [] if is_read else changes.keys() & set(group):
+            raise UserError(f"the model has no {' or '.join(group)}, so MJX does not read '{name}'; give it a value")
 
 
 def _dotted(path: tuple[Any, ...]) -> str:

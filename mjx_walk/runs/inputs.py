@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_walk.envs import TASKS, Task, TaskOptions
-from mjx_walk.envs.model_files import model_path, source_hashes
+from mjx_walk.envs.model_files import changed_names, model_path, source_hashes
 from mjx_walk.envs.registry import task_hashes
 from mjx_walk.envs.user_files import source_path
 from mjx_walk.runs.run_folder import RunFolder
@@ -30,7 +30,7 @@ Gymnasium's own model counts for `env.xml_file`."""
 def read_inputs(task: Task) -> Inputs:
     """The files that a task has read."""
     options = task.options
-    inputs = {_MODEL: source_hashes(task.model_file)}
+    inputs = {_MODEL: task.model_sources}
     for key, source, hashes in (
         (_REWARD, options.reward_function, task.reward_hashes),
         (_TASK, options.task, task_hashes(options.name)),
@@ -107,7 +107,7 @@ def _changes(folder: RunFolder, options: TaskOptions) -> list[tuple[str, Path]]:
     changes = []
     for key, recorded in _read(folder).items():
         root, present = _present(key, recorded, options)
-        changed = [name for name in {**recorded, **present} if recorded.get(name) != present.get(name)]
+        changed = changed_names(recorded, present)
         if root and changed:
             changes.append((key, root / changed[0]))
     return changes
