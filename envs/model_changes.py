@@ -1,7 +1,7 @@
 """Changes of a MuJoCo model after an engine has read it. They have no effect, so they are refused."""
 
 import fnmatch
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import mujoco
 import numpy as np
@@ -32,15 +32,30 @@ APPEARANCE: dict[str, str] = {
 }
 """Patterns of the model's values that no simulation depends on, and what they are. `model.vis` is appearance, too."""
 
+_SEEN_IN = {
+    "cam_*": ("cam_*", "sensordata"),
+    "light_*": ("light_*",),
+    "*_rgba": ("sensordata",),  # rays of rangefinders pass through what is transparent
+    "*_matid": ("sensordata",),
+    "mat_*": ("sensordata",),
+}
+"""Patterns of `APPEARANCE` on which arrays of `mjData` depend, and patterns of those arrays."""
+
 
 class ModelSnapshot:
-    """The values of a model that a simulation may depend on: all but `APPEARANCE`.
+    """The values of a model that a task may depend on: all but `APPEARANCE`, unless the task reads it.
 
     It also sees changes through views, such as `model.geom("floor").friction[0] = 2`.
     """
 
-    def __init__(self, model: mujoco.MjModel):
-        self._values = dict(_readers(model))
+    def __init__(self, model: mujoco.MjModel, derived: Sequence[str] = ()):
+        """
+        Args:
+            model: the model.
+            derived: names of the `mjData` arrays that the task reads.
+        """
+        ignored = [pattern for pattern in APPEARANCE if not _is_seen(pattern, derived)]
+        self._values = dict(_readers(model, ignored))
         self._original = {name: read() for name, read in self._values.items()}
 
     def names(self) -> tuple[str, ...]:
@@ -58,11 +73,16 @@ class ModelSnapshot:
                 raise UserError(f"the physics ignores your change to model.{name}; use xml_file=PATH instead")
 
 
-def _readers(model: mujoco.MjModel) -> Iterator[tuple[str, Callable[[], bytes | float]]]:
-    """A function for each value that gives its present content."""
+def _is_seen(pattern: str, derived: Sequence[str]) -> bool:
+    """Whether an array of `mjData` that a task reads depends on values of this pattern."""
+    return any(fnmatch.fnmatchcase(name, array) for array in _SEEN_IN.get(pattern, ()) for name in derived)
+
+
+def _readers(model: mujoco.MjModel, ignored: Sequence[str]) -> Iterator[tuple[str, Callable[[], bytes | float]]]:
+    """A function for each value, except for patterns to ignore, that gives its present content."""
     for prefix, owner in (("", model), ("opt.", model.opt), ("stat.", model.stat)):
         for name in dir(owner):
-            if name.startswith("_") or any(fnmatch.fnmatchcase(prefix + name, pattern) for pattern in APPEARANCE):
+            if name.startswith("_") or any(fnmatch.fnmatchcase(prefix + name, pattern) for pattern in ignored):
                 continue
             value = getattr(owner, name)
             if isinstance(value, np.ndarray):

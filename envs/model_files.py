@@ -17,8 +17,8 @@ ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 """Gymnasium's models."""
 
 _ATTRIBUTE = re.compile(r"""([\w:.-]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
-_TAG = re.compile(r"""<!--.*?-->|<([\w:.-]+)((?:[^<>"']|"[^"]*"|'[^']*')*)>""", re.DOTALL)
-"""A comment, or a tag and its attributes."""
+_TAG = re.compile(r"""<!--.*?-->|<!\[CDATA\[.*?\]\]>|<!.*?>|<([\w:.-]+)((?:[^<>"']|"[^"]*"|'[^']*')*)>""", re.DOTALL)
+"""A comment, text in CDATA or a declaration; or a tag and its attributes."""
 _FILE = re.compile("file(name|right|left|up|down|front|back)?")
 """Attributes that name a file."""
 _FOLDERS = {"mesh": "meshdir", "flexcomp": "meshdir", "texture": "texturedir"}
@@ -128,7 +128,7 @@ def _read_tags(
     found[name] = None
     place = os.path.dirname(name)
     text = (root / name).read_bytes().decode("utf-8", "surrogateescape")
-    for tag, content in _TAG.findall(text):  # with comments, whose tag is empty
+    for tag, content in _TAG.findall(text):  # with comments and text, whose tag is empty
         attributes = {
             key: html.unescape(double or single).replace("\\", "/")  # MuJoCo takes both for a separator
             for key, double, single in _ATTRIBUTE.findall(content)

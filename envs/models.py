@@ -20,9 +20,9 @@ from mjx_walk.utils.quiet_mujoco import hide_deprecations, write_no_log
 _LOGGER = logging.getLogger(__name__)
 
 
-_OWN_CHOICE = 4 * 2**20
-"""Memory that MuJoCo gives to the smallest model unless the file names another, bytes."""
-_TOO_LITTLE_MEMORY = 'memory="…" in <size> is too little for its contacts and limits; remove it, and MuJoCo chooses'
+_TOO_LITTLE_MEMORY = (
+    "its <size> leaves too little memory for its contacts and limits; remove memory, nstack, njmax and nconmax"
+)
 _LOST = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 """MuJoCo's warnings that it has left out contacts or constraints."""
 _EVERYWHERE = 1e3
@@ -63,17 +63,19 @@ def load_model(xml_file: str) -> mujoco.MjModel:
         if "(increase <size memory" in str(error):
             raise UserError(f"{path}: {_TOO_LITTLE_MEMORY}") from error
         raise UserError(f"MuJoCo cannot read {path}: {_in_one_line(str(error))}") from error
-    if not _has_enough_memory(model):
+    if not _has_enough_memory(path, model):
         raise UserError(f"{path}: {_TOO_LITTLE_MEMORY}")
     return model
 
 
-def _has_enough_memory(model: mujoco.MjModel) -> bool:
-    """Whether the memory that a model file names suffices while every contact and every limit acts.
+def _has_enough_memory(path: Path, model: mujoco.MjModel) -> bool:
+    """Whether the memory that a model file names, if any, suffices while every contact and every limit acts.
 
     With less, MuJoCo leaves out constraints, or stops with an error in the middle of an episode.
     """
-    if model.narena >= _OWN_CHOICE:
+    with hide_deprecations():
+        spec = mujoco.MjSpec.from_file(str(path))
+    if all(size < 0 for size in (spec.memory, spec.nstack, spec.njmax, spec.nconmax)):  # MuJoCo chooses
         return True
     worst = copy.deepcopy(model)
     for margin in (worst.geom_margin, worst.pair_margin, worst.jnt_margin, worst.tendon_margin):

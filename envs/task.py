@@ -84,7 +84,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         derived = tuple(dict.fromkeys((*self.derived_names(), *self.kept_arrays)))
         self.engine = make_engine(resolve_engine(physics), self.model, options.frame_skip, derived)
         models.check_pose(self.model, derived)
-        self._snapshot = ModelSnapshot(self.model)
+        self._snapshot = ModelSnapshot(self.model, derived)
         low, high = self.model.actuator_ctrlrange.T
         self.action_low, self.action_high = jnp.float32(low), jnp.float32(high)
         self.action_size = self.model.nu

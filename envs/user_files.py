@@ -8,7 +8,7 @@ import importlib.util
 import itertools
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -117,7 +117,7 @@ class UserFile:
 
     @property
     def hashes(self) -> dict[str, str]:
-        """SHA-256 of the files that ran so far, by absolute path."""
+        """SHA-256 of the files that ran so far, and of those that they may import later, by absolute path."""
         return dict(self._finder.hashes)
 
 
@@ -131,7 +131,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
             known: SHA-256 of the files that may run, by absolute path; None for any.
         """
         self.hashes: dict[str, str] = {}
-        """SHA-256 of the files that ran, by absolute path."""
+        """SHA-256 of the files that ran or that those import anywhere, as in a function; by absolute path."""
         self._folder = folder
         self._known = known
         self._tops: set[str] = set()
@@ -193,9 +193,49 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         if self._known is not None and self._known.get(file) != found:
             raise UserError(f"{file} is new or has changed since you named it; to run it, add this to the command line")
         self.hashes[file] = found
+        self._hash_imports(Path(file), source)
         exec(compile(source, file, "exec", dont_inherit=True), vars(module))
         if not module.__name__.startswith(_PREFIX):
             self._loaded[module.__name__] = module
+
+    def _hash_imports(self, file: Path, source: bytes) -> None:
+        """Hash the helpers that a file imports anywhere, and theirs."""
+        for helper in _imported_files(file, source, self._folder):
+            if str(helper) not in self.hashes:
+                content = helper.read_bytes()
+                self.hashes[str(helper)] = hashlib.sha256(content).hexdigest()
+                self._hash_imports(helper, content)
+
+
+def _imported_files(file: Path, source: bytes, folder: Path) -> Iterator[Path]:
+    """Files in a folder that a Python file imports. It is read and not run."""
+    try:
+        nodes = list(ast.walk(ast.parse(source)))
+    except (SyntaxError, ValueError, RecursionError):
+        return  # running it reports it
+    for node in nodes:
+        start = folder
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            start = file.parents[node.level - 1] if node.level else folder
+            names = [".".join(filter(None, (node.module, alias.name))) for alias in node.names]
+        else:
+            continue
+        for name in names:
+            if start != folder or name.partition(".")[0] not in _NEVER_HELPERS:
+                yield from _files_of(start, name)
+
+
+def _files_of(folder: Path, name: str) -> Iterator[Path]:
+    """Files that run when a module of a folder is imported: its packages, and its own."""
+    place = folder
+    for part in name.split("."):
+        place /= part
+        found = next((path for path in (place / "__init__.py", place.with_name(f"{part}.py")) if path.is_file()), None)
+        if found is None:
+            return
+        yield found
 
 
 def load_reward_function(source: str) -> UserFile:

@@ -9,10 +9,11 @@ import warnings
 
 import mujoco
 
+from mjx_walk.envs.physics.approximations import warn_of_approximations
 from mjx_walk.envs.physics.base import Derived, Engine, PhysicsState
 from mjx_walk.envs.physics.derived_arrays import refuse_derived
 from mjx_walk.envs.physics.preparation import nothing_runs
-from mjx_walk.envs.physics.supported import refuse_unsupported, unsupported_by_mjx, warn_of_approximations
+from mjx_walk.envs.physics.supported import refuse_unsupported, unsupported_by_mjx
 from mjx_walk.utils.devices import default_backend, default_device
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.nvidia import Machine, installed_version, warn_of_unused_gpu, warp_misfit

@@ -82,7 +82,7 @@ class CEngine:
         next_state = tuple(np.empty(x.shape, np.float32) for x in state)
         derived = self._empty_derived(len(ctrl))
         self._for_each_env(len(ctrl), functools.partial(self._step_one, state, ctrl, next_state, derived))
-        return next_state, derived, np.zeros(len(ctrl), np.bool_)
+        return next_state, derived, np.zeros(len(ctrl), np.bool_)  # `load_model` refuses models with too little memory
 
     def _step_one(
         self,

@@ -5,7 +5,6 @@ guess. Mocap bodies and equality flags never change during an episode, so they n
 on every engine. MJX silently ignores further features; those are refused on its engines.
 """
 
-import logging
 from typing import NamedTuple
 
 import mujoco
@@ -13,9 +12,7 @@ import mujoco
 from mjx_walk.envs.physics import constraint_settings, elements
 from mjx_walk.utils.errors import UserError, first_line
 
-__all__ = ["refuse_unsupported", "unsupported_by_mjx", "warn_of_approximations"]
-
-_LOGGER = logging.getLogger(__name__)
+__all__ = ["refuse_unsupported", "unsupported_by_mjx"]
 
 _EVERY = ("warp", "jax", "c")
 _MJX = ("warp", "jax")
@@ -124,7 +121,7 @@ _FEATURES = (
         _MJX,
         elements.named("body", elements.balanced_bodies),
         "contacts of a body whose joints only turn it about its center of mass",
-        "move the body's joint or mass slightly",
+        "move the body's joint or mass by a fifth of its size",
     ),
     _Feature(
         _MJX,
@@ -167,6 +164,12 @@ _FEATURES = (
         elements.named("actuator", elements.motors_limited_twice),
         "limits of single motors on a tendon that limits their sum",
         "remove forcerange from the motors, or actuatorfrcrange from the tendon",
+    ),
+    _Feature(
+        ("jax",),
+        elements.named("body", elements.turning_bodies),
+        "contacts of a body whose joints turn it almost about its center of mass",
+        "move the body's joint or mass by a fifth of its size",
     ),
     _Feature(
         ("jax",),
@@ -235,45 +238,3 @@ _FEATURES = (
         "set noslip_iterations to 0 in <option>",
     ),
 )
-
-_Geom = mujoco.mjtGeom
-_AS_IN_MUJOCO = {
-    *((_Geom.mjGEOM_PLANE, other) for other in (_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_CAPSULE)),
-    (_Geom.mjGEOM_PLANE, _Geom.mjGEOM_ELLIPSOID),
-    *((_Geom.mjGEOM_SPHERE, other) for other in (_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_BOX)),
-    (_Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_CAPSULE),
-}
-"""Pairs of geoms whose contacts the `jax` engine finds as MuJoCo does. For others it finds other points."""
-
-
-def warn_of_approximations(model: mujoco.MjModel, engine: str, enough_iterations: int) -> None:
-    """Log a warning for what an MJX engine simulates, but otherwise than MuJoCo's C library.
-
-    Args:
-        model: the model as loaded.
-        engine: `warp` or `jax`.
-        enough_iterations: iterations of the constraint solver that suffice to converge.
-    """
-    fewest = min(model.opt.iterations, model.opt.ls_iterations)
-    if fewest < enough_iterations:
-        _LOGGER.warning(
-            "the model stops the constraint solver after %d iterations; physics=%s lets it converge, unlike physics=c",
-            fewest,
-            engine,
-        )
-    if engine != "jax":
-        return
-    from mujoco.mjx._src import collision_driver
-
-    for first, second, _ in collision_driver.geom_pairs(model):
-        kinds = tuple(_Geom(model.geom_type[geom]) for geom in (first, second))
-        if kinds not in _AS_IN_MUJOCO:
-            names = [kind.name.removeprefix("mjGEOM_").lower() for kind in kinds]
-            _LOGGER.warning(
-                "physics=jax finds other contact points than MuJoCo between %s and %s; physics=warp or c is closer",
-                *(
-                    f"{kind} '{model.geom(int(geom)).name or geom}'"
-                    for kind, geom in zip(names, (first, second), strict=True)
-                ),
-            )
-            return

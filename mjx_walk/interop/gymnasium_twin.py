@@ -87,8 +87,11 @@ class MujocoAttributes:
             UserError: Gymnasium's environment reads the attribute, and this one does not.
         """
         twin = getattr(self, "_twin", None)  # None while the environment is built
-        if twin is not None and name in vars(twin) and name not in _SETTABLE:
+        is_read = twin is not None and (name in vars(twin) or hasattr(type(twin), name))
+        if is_read and name not in _SETTABLE and not hasattr(gymnasium.Env, name):
             instead = {"model": "; use xml_file=PATH instead", "data": "; use set_state instead"}
+            if callable(getattr(type(twin), name, None)):
+                instead[name] = "; write a task of your own instead"
             keyword = name.removeprefix("_")
             if keyword in (*inspect.signature(type(twin)).parameters, *RENDER_KEYWORDS):
                 instead[name] = f"; give {keyword}=… to gymnasium.make instead"

@@ -107,6 +107,28 @@ def test_every_value_is_watched_or_appearance():
     snapshot.refuse_changes()
 
 
+@pytest.mark.parametrize(
+    ("name", "derived", "is_refused"),
+    [
+        ("cam_pos", ("qfrc_passive",), False),
+        ("cam_pos", ("cam_xpos",), True),
+        ("cam_fovy", ("sensordata",), True),
+        ("geom_rgba", ("cam_xpos",), False),
+        ("geom_rgba", ("sensordata",), True),
+        ("light_pos", ("light_xpos",), True),
+        ("light_pos", ("sensordata",), False),
+    ],
+)
+def test_appearance_that_a_task_reads_is_watched(name, derived, is_refused):
+    model = load()
+    snapshot = ModelSnapshot(model, derived)
+    change(model, name)
+    if not is_refused:
+        return snapshot.refuse_changes()
+    with pytest.raises(UserError, match=f"model.{name}; "):
+        snapshot.refuse_changes()
+
+
 def test_the_physics_does_not_depend_on_appearance():
     def trajectory(model):
         data = mujoco.MjData(model)

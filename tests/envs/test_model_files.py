@@ -102,6 +102,15 @@ ODD = {
         f'<mujoco model="<!--"><include file="b.xml"/>{BODY}<!-- --></mujoco>',
         {"b.xml": '<mujoco><asset><mesh name="m" file="m.obj"/></asset></mujoco>', "m.obj": TETRAHEDRON},
     ),
+    "text and declarations": (
+        '<mujoco><!ELEMENT <include file="x.xml"/>><![CDATA[<include file="x.xml"/>]]><include file="b.xml"/>'
+        f"{BODY}</mujoco>",
+        {
+            "b.xml": '<mujoco><asset><mesh name="m" file="m.obj"/></asset></mujoco>',
+            "m.obj": TETRAHEDRON,
+            "x.xml": "<mujoco/>",
+        },
+    ),
     "urdf": (
         '<robot name="r"><mujoco><compiler strippath="false"/></mujoco><link name="base"><inertial><mass value="1"/>'
         '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry>'

@@ -70,8 +70,30 @@ def test_memory_suffices_or_is_refused(memory, tmp_path):
         return
     with pytest.raises(UserError) as refused:
         load_model(str(path))
-    advice = 'memory="…" in <size> is too little for its contacts and limits; remove it, and MuJoCo chooses'
-    assert str(refused.value) == f"{path}: {advice}"
+    advice = "remove memory, nstack, njmax and nconmax"
+    assert str(refused.value) == f"{path}: its <size> leaves too little memory for its contacts and limits; {advice}"
+
+
+def test_memory_that_suffices_only_at_first_is_refused(tmp_path):
+    """Twenty boxes in a row lose contacts as soon as they have piled up."""
+    boxes = "".join(
+        f'<body pos="{i} 0 0.095"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>' for i in range(40)
+    )
+    path = tmp_path / "boxes.xml"
+    for size, is_enough in (
+        ('memory="4M"', False),
+        ('njmax="50" nconmax="50"', False),
+        ('memory="60M"', True),
+        ("", True),
+    ):
+        path.write_text(
+            f'<mujoco><size {size}/><worldbody><geom type="plane" size="9 9 1"/>{boxes}</worldbody></mujoco>'
+        )
+        if is_enough:
+            load_model(str(path))
+            continue
+        with pytest.raises(UserError, match="leaves too little memory"):
+            load_model(str(path))
 
 
 @pytest.mark.filterwarnings("ignore")

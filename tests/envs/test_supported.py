@@ -9,6 +9,7 @@ from mujoco.mjx._src import collision_driver
 from trajectories import visited_states
 
 from mjx_walk.envs.physics import PhysicsState, make_engine, static_pairs
+from mjx_walk.envs.physics.approximations import warn_of_approximations
 from mjx_walk.envs.physics.jax_model import adapt_model
 from mjx_walk.envs.physics.static_pairs import drop_static_pairs
 from mjx_walk.utils.errors import UserError
@@ -52,6 +53,15 @@ GENERAL = '<general name="m" joint="knee" ctrlrange="-1 1" {}/>'
 FIXED = '<fixed name="t" {}><joint joint="hinge" coef="1"/><joint joint="knee" coef="-.7"/></fixed>'
 SPATIAL = '<spatial name="t" {}><site site="back"/><site site="tip"/></spatial>'
 SPHERE = 'type="sphere" size=".05"'
+WHEEL = '<body name="wheel" pos="2 0 .1"><joint axis="0 1 0"/><geom size=".12" pos="{} 0 0"/></body>'
+CAPSULES = """
+<mujoco>
+  <worldbody>
+    <geom type="capsule" size=".05" fromto="0 -.1 0 0 .1 0" {}/>
+    <body pos="0 0 .1"><joint axis="0 1 0"/><geom type="capsule" size=".05" fromto=".1 -.1 0 {}"/></body>
+  </worldbody>
+</mujoco>
+"""
 ALL, MJX, JAX, WARP = ("c", "jax", "warp"), ("jax", "warp"), ("jax",), ("warp",)
 
 REFUSED = {
@@ -88,7 +98,7 @@ REFUSED = {
     ),
     "wheel": (
         MJX,
-        {"world": '<body name="wheel" pos="2 0 .1"><joint axis="0 1 0"/><geom size=".12"/></body>'},
+        {"world": WHEEL.format(0)},
         "contacts of a body whose joints only turn it about its center of mass (body 'wheel')",
     ),
     "mixed_contact": (MJX, {"shin": 'solref="-1000 1"'}, "a solref of one positive number"),
@@ -123,6 +133,7 @@ REFUSED = {
         },
         "limits of single motors on a tendon that limits their sum (motor 'm')",
     ),
+    "almost_balanced_wheel": (JAX, {"world": WHEEL.format(0.02)}, "almost about its center of mass (body 'wheel')"),
     "no_width": (JAX, {"shin": 'solimp=".3 .9 0"'}, "a solimp of width zero as MuJoCo does (geom 'shin')"),
     "no_width_of_a_limit": (
         JAX,
@@ -238,6 +249,7 @@ SIMULATED = {
         '<body mocap="true" pos="3 0 .05"><geom name="far" size=".08"/></body><geom name="x" size=".1" pos="4 0 0"/>',
         "contact": '<pair geom1="x" geom2="far" margin="2"/><pair geom1="x" geom2="floor"/>',
     },
+    "wheel": {"world": WHEEL.format(0.03)},
     "wind": {"option": 'density="5" viscosity=".5" wind="3 0 0"'},
     "no_filterparent": {"flag": '<flag filterparent="disable"/>'},
     "no_clampctrl_no_damper": {
@@ -267,6 +279,16 @@ def test_refused_by_name(name):
         assert says in str(refused.value) and "\n" not in str(refused.value)
     if "c" not in engines:
         make_engine("c", load(parts), 1, ())
+
+
+@pytest.mark.parametrize(
+    ("end", "contact", "is_warned_of"),
+    [(".1 .1 0", "", True), (".1 .1 .01", "", False), (".1 .1 0", 'contype="0" conaffinity="0"', False)],
+)
+def test_capsules_that_stay_parallel_are_warned_of(end, contact, is_warned_of, caplog):
+    """MuJoCo has two contacts between them, the `jax` engine one."""
+    warn_of_approximations(mujoco.MjModel.from_xml_string(CAPSULES.format(contact, end)), "jax", 0)
+    assert ("between capsule '0' and capsule '1'; physics=warp" in caplog.text) == is_warned_of
 
 
 def test_contacts_between_bodies_that_cannot_move_are_dropped():

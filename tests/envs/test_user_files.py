@@ -135,6 +135,21 @@ def test_only_the_known_files_run(tmp_path, name, clean):
         only_known(path, None)
 
 
+def test_helpers_that_run_later_are_hashed(tmp_path, clean):
+    """So that a change of one is noticed, and a resume may run it."""
+    source = write(tmp_path)
+    (tmp_path / "my_helper.py").write_text(
+        "def factor():\n    import my_late, my_package.constants as c, json, numpy\n"
+    )
+    (tmp_path / "my_late.py").write_text("import my_helper\nnot python\n")
+    file = load_reward_function(f"{source}:reward")
+    names = ["my_helper.py", "my_late.py", "my_package/__init__.py", "my_package/constants.py", "my_package/deeper.py"]
+    assert sorted(file.hashes) == sorted(str(tmp_path / name) for name in (*names, "my_reward.py"))
+    assert changed_file(file.hashes) is None
+    (tmp_path / "my_late.py").write_text("")
+    assert changed_file(file.hashes) == str(tmp_path / "my_late.py")
+
+
 def test_a_new_helper_is_not_known(tmp_path, clean):
     """It would run in place of a module that the reward file has imported from elsewhere."""
     (tmp_path / "r.py").write_text("import colorama_or_so\n\n\ndef reward(step):\n    return 1\n")

@@ -212,6 +212,11 @@ def test_attributes_without_effect_cannot_be_set(num_envs):
         part._reset_noise_scale = 0.0
     with pytest.raises(UserError, match="ignores your value of data; use set_state instead"):
         part.data = None
+    for method in ("reset_model", "_get_obs", "do_simulation", "set_state"):
+        with pytest.raises(UserError, match=f"ignores your value of {method}; write a task of your own instead"):
+            setattr(part, method, print)
+    with pytest.raises(UserError, match=r"ignores your value of dt$"):
+        part.dt = 0.1
     part.my_note = 1
     assert part.my_note == 1
 

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import hydra
 import pytest
@@ -15,6 +16,7 @@ from omegaconf import OmegaConf
 from omegaconf.basecontainer import BaseContainer
 
 from mjx_walk.runs.config import load_config
+from mjx_walk.runs.own_hydra import own_hydra
 
 PROGRAM = """
 import hydra
@@ -65,6 +67,26 @@ def test_the_state_of_hydra_is_the_one_from_before(tmp_path):
         store.repo.clear()
         store.repo.update(former)
         OmegaConf.clear_resolver("now")
+
+
+def test_other_threads_keep_their_own_state(tmp_path):
+    """While one thread loads a configuration, another composes its own and registers a resolver."""
+    (tmp_path / "theirs.yaml").write_text("speed: 1\ndouble: ${twice:${speed}}\n")
+
+    def work():
+        OmegaConf.register_new_resolver("twice", lambda number: 2 * number)
+        config = hydra.compose("theirs", ["speed=4"])
+        return config.double, len(Singleton.get_state()["omegaconf_resolvers"])
+
+    with hydra.initialize_config_dir(str(tmp_path), version_base="1.3"), ThreadPoolExecutor(1) as pool:
+        with own_hydra():
+            num_resolvers = len(BaseContainer._resolvers)
+            assert pool.submit(work).result() == (8, num_resolvers + 1)
+            assert not OmegaConf.has_resolver("twice") and not GlobalHydra.instance().is_initialized()
+        assert OmegaConf.has_resolver("twice") and hydra.compose("theirs").double == 2
+        with own_hydra():
+            pool.submit(OmegaConf.clear_resolvers).result()
+        assert not OmegaConf.has_resolver("twice")
 
 
 @pytest.mark.slow  # a process of its own

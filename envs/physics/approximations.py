@@ -1,0 +1,59 @@
+"""What the MJX engines simulate otherwise than MuJoCo's C library. The user is warned of it."""
+
+import logging
+from collections.abc import Iterator
+
+import mujoco
+
+from mjx_walk.envs.physics import elements
+
+__all__ = ["warn_of_approximations"]
+
+_LOGGER = logging.getLogger(__name__)
+
+_Geom = mujoco.mjtGeom
+_AS_IN_MUJOCO = {
+    *((_Geom.mjGEOM_PLANE, other) for other in (_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_CAPSULE)),
+    (_Geom.mjGEOM_PLANE, _Geom.mjGEOM_ELLIPSOID),
+    *((_Geom.mjGEOM_SPHERE, other) for other in (_Geom.mjGEOM_SPHERE, _Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_BOX)),
+    (_Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_CAPSULE),
+}
+"""Pairs of geoms whose contacts the `jax` engine finds as MuJoCo does. For others it finds other points."""
+
+
+def warn_of_approximations(model: mujoco.MjModel, engine: str, enough_iterations: int) -> None:
+    """Log a warning for what an MJX engine simulates, but otherwise than MuJoCo's C library.
+
+    Args:
+        model: the model as loaded.
+        engine: `warp` or `jax`.
+        enough_iterations: iterations of the constraint solver that suffice to converge.
+    """
+    fewest = min(model.opt.iterations, model.opt.ls_iterations)
+    if fewest < enough_iterations:
+        _LOGGER.warning(
+            "the model stops the constraint solver after %d iterations; physics=%s lets it converge, unlike physics=c",
+            fewest,
+            engine,
+        )
+    pair = next(_other_contacts(model), None) if engine == "jax" else None
+    if pair:
+        _LOGGER.warning(
+            "physics=jax finds other contact points than MuJoCo between %s and %s; physics=warp or c is closer",
+            *(
+                f"{_kind(model, geom).name.removeprefix('mjGEOM_').lower()} '{model.geom(geom).name or geom}'"
+                for geom in pair
+            ),
+        )
+
+
+def _other_contacts(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
+    """Pairs of geoms whose contacts `jax` finds at other points than MuJoCo."""
+    for (first, second), _ in elements.pairs_that_move(model):
+        if (_kind(model, first), _kind(model, second)) not in _AS_IN_MUJOCO:
+            yield int(first), int(second)
+    yield from elements.parallel_capsules(model)
+
+
+def _kind(model: mujoco.MjModel, geom: int) -> mujoco.mjtGeom:
+    return mujoco.mjtGeom(model.geom_type[geom])
