@@ -49,9 +49,10 @@ def warn_of_approximations(model: mujoco.MjModel, engine: str, enough_iterations
 
 def _other_contacts(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
     """Pairs of geoms whose contacts `jax` finds at other points than MuJoCo."""
-    for (first, second), _ in elements.pairs_that_move(model):
+    geoms, _ = elements.pairs_that_move(model)
+    for first, second in geoms.tolist():
         if (_kind(model, first), _kind(model, second)) not in _AS_IN_MUJOCO:
-            yield int(first), int(second)
+            yield first, second
     yield from elements.parallel_capsules(model)
 
 

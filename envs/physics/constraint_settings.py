@@ -29,10 +29,10 @@ def _used(
     model: mujoco.MjModel,
 ) -> Iterator[tuple[str, int, Shaped[np.ndarray, " 2"], Shaped[np.ndarray, " 5"]]]:
     """Kind and index of each element that can make a constraint, with its `solref` and `solimp`."""
-    touching = list(pairs_that_move(model))
-    for geom in sorted({int(geom) for geoms, pair in touching if pair < 0 for geom in geoms}):
+    geoms, pairs = pairs_that_move(model)
+    for geom in map(int, np.unique(geoms[pairs < 0])):
         yield "geom", geom, model.geom_solref[geom], model.geom_solimp[geom]
-    for pair in sorted({int(pair) for _, pair in touching if pair >= 0}):
+    for pair in map(int, pairs[pairs >= 0]):
         yield "pair", pair, model.pair_solref[pair], model.pair_solimp[pair]
         yield "pair", pair, model.pair_solreffriction[pair], model.pair_solimp[pair]
     for joint in np.flatnonzero(model.jnt_limited):

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 import mujoco
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Int, Shaped
 
 Users = Callable[[mujoco.MjModel], Iterator[str]]
 """The elements of a model that use a feature, as `kind 'name'`."""
@@ -14,8 +14,8 @@ LEAST_PYRAMIDAL_FRICTION = 0.05
 """With it, velocities after a step differ from C's by at most 1.1e-3, relative to one plus their change."""
 
 _MOST_TURNING = 25.0
-"""Largest ratio of mobilities in `turning_bodies`. With a wheel of 16 on the floor, 90% of the velocities differ from C's
-by at most 3e-5, relative to one plus their change. At 36 it is 7e-3, and at 14,400 the largest error is 80."""
+"""Largest ratio of mobilities in `turning_bodies`. With a wheel of ratio 16 on the floor, 90% of the velocities differ
+from C's by at most 3e-5, relative to one plus their change. With 36 it is 7e-3. With 14,400 the largest error is 80."""
 
 _SPOKEN = {"actuator": "motor", "eq": "equality constraint", "pair": "contact pair"}
 
@@ -123,36 +123,38 @@ def slippery_contacts(model: mujoco.MjModel) -> Iterator[str]:
     """
     if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
         return
-    for geoms, pair in pairs_that_move(model):
-        condim, friction = _contact_friction(model, geoms, pair)
-        if condim > 1 and friction < LEAST_PYRAMIDAL_FRICTION:
-            yield "geoms " + " and ".join(f"'{model.geom(int(geom)).name or geom}'" for geom in geoms)
+    geoms, pairs = pairs_that_move(model)
+    condim, friction = _contact_friction(model, geoms, pairs)
+    for both in geoms[(condim > 1) & (friction < LEAST_PYRAMIDAL_FRICTION)]:
+        yield "geoms " + " and ".join(f"'{model.geom(int(geom)).name or geom}'" for geom in both)
 
 
-def pairs_that_move(model: mujoco.MjModel) -> Iterator[tuple[list[int], int]]:
-    """Pairs of geoms that may touch, of which at least one moves, and the index of their `<pair>`, or -1."""
+def pairs_that_move(model: mujoco.MjModel) -> tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, " n"]]:
+    """Pairs of geoms that may touch, of which at least one moves, and the indices of their `<pair>`, or -1."""
     from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
     from mujoco.mjx._src import collision_driver
 
-    if model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
-        return
-    moves = _moving_bodies(model)
-    for *geoms, pair in collision_driver.geom_pairs(model):
-        if moves[model.geom_bodyid[geoms]].any():
-            yield geoms, pair
+    is_off = model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    pairs = np.array([] if is_off else [*collision_driver.geom_pairs(model)], int).reshape(-1, 3)
+    pairs = pairs[_moving_bodies(model)[model.geom_bodyid[pairs[:, :2]]].any(axis=1)]
+    return pairs[:, :2], pairs[:, 2]
 
 
 def _moving_bodies(model: mujoco.MjModel) -> Shaped[np.ndarray, " bodies"]:
     return model.body_dofnum[model.body_weldid] > 0
 
 
-def _contact_friction(model: mujoco.MjModel, geoms: list[int], pair: int) -> tuple[int, float]:
-    """Dimension and sliding friction of the contacts of two geoms, as C combines them."""
-    if pair >= 0:
-        return model.pair_dim[pair], model.pair_friction[pair, 0]
+def _contact_friction(
+    model: mujoco.MjModel, geoms: Int[np.ndarray, "n 2"], pairs: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " n"], Shaped[np.ndarray, " n"]]:
+    """Dimension and sliding friction of the contacts of pairs of geoms, as C combines them."""
     priority = model.geom_priority[geoms]
-    used = [geom for geom, own in zip(geoms, priority, strict=True) if own == priority.max()]
-    return model.geom_condim[used].max(), model.geom_friction[used, 0].max()
+    is_used = priority == priority.max(axis=1, keepdims=True)
+    condim = np.where(is_used, model.geom_condim[geoms], 0).max(axis=1)
+    friction = np.where(is_used, model.geom_friction[geoms, 0], 0.0).max(axis=1)
+    is_own = pairs >= 0
+    condim[is_own], friction[is_own] = model.pair_dim[pairs[is_own]], model.pair_friction[pairs[is_own], 0]
+    return condim, friction
 
 
 def branching_armatures(model: mujoco.MjModel) -> Shaped[np.ndarray, " tendons"]:
@@ -180,8 +182,7 @@ def _is_chain(model: mujoco.MjModel, dofs: Shaped[np.ndarray, " n"]) -> bool:
 def balanced_bodies(model: mujoco.MjModel) -> Shaped[np.ndarray, " bodies"]:
     """Moving bodies with contacts whose centre of mass no joint moves. MJX's solver divides by their inertia, zero."""
     collides = np.zeros(model.nbody, bool)
-    for geoms, _ in pairs_that_move(model):
-        collides[model.geom_bodyid[geoms]] = True
+    collides[model.geom_bodyid[pairs_that_move(model)[0]]] = True
     return _moving_bodies(model) & collides & (model.body_invweight0[:, 0] < mujoco.mjMINVAL)
 
 
@@ -190,32 +191,30 @@ def turning_bodies(model: mujoco.MjModel) -> Shaped[np.ndarray, " bodies"]:
 
     `jax` regularizes a contact by the mobility of the centre of mass, and its solver computes in float32.
     """
+    geoms = np.unique(pairs_that_move(model)[0])
+    bodies = model.geom_bodyid[geoms]
+    distance = np.linalg.norm(model.geom_pos[geoms] - model.body_ipos[bodies], axis=1) + model.geom_rbound[geoms]
     reach = np.zeros(model.nbody)
-    for geoms, _ in pairs_that_move(model):
-        for geom in geoms:
-            body = model.geom_bodyid[geom]
-            distance = np.linalg.norm(model.geom_pos[geom] - model.body_ipos[body]) + model.geom_rbound[geom]
-            reach[body] = max(reach[body], distance)
+    np.maximum.at(reach, bodies, distance)
     centre, turning = model.body_invweight0.T
     return _moving_bodies(model) & (turning * reach**2 > _MOST_TURNING * centre)
 
 
 def parallel_capsules(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
     """Pairs of capsules that may touch and are parallel in every pose. MuJoCo gives them two contacts, `jax` one."""
-    is_capsule = model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
-    pairs = [geoms for geoms, _ in pairs_that_move(model) if is_capsule[geoms].all()]
-    if not pairs:
+    geoms = pairs_that_move(model)[0]
+    geoms = geoms[(model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_CAPSULE).all(axis=1)]
+    if not geoms.size:
         return
     data = mujoco.MjData(model)
-    first, second = np.transpose(pairs)
-    is_parallel = np.ones(len(pairs), bool)
+    is_parallel = np.ones(len(geoms), bool)
     for speed in (0.0, 1.0, 2.0):
         mujoco.mj_integratePos(model, data.qpos, speed * np.sin(1.0 + np.arange(model.nv)), 1.0)
         mujoco.mj_kinematics(model, data)
-        axes = data.geom_xmat.reshape(-1, 3, 3)[:, :, 2]
-        is_parallel &= np.linalg.norm(np.cross(axes[first], axes[second]), axis=1) < 1e-6
-    for geoms in np.array(pairs)[is_parallel]:
-        yield int(geoms[0]), int(geoms[1])
+        axes = data.geom_xmat.reshape(-1, 3, 3)[geoms, :, 2]
+        is_parallel &= np.linalg.norm(np.cross(axes[:, 0], axes[:, 1]), axis=1) < 1e-6
+    for first, second in geoms[is_parallel]:
+        yield int(first), int(second)
 
 
 def motors_limited_twice(model: mujoco.MjModel) -> Shaped[np.ndarray, " motors"]:

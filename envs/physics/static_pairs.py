@@ -5,6 +5,7 @@ solver divides by their zero inertia. MJX's JAX implementation keeps all of them
 """
 
 import functools
+import itertools
 from collections.abc import Callable, Iterator
 
 import mujoco
@@ -17,9 +18,7 @@ _NEVER = -1e10
 """Margin of a pair that is never in contact, m."""
 
 
-def _is_static_pair(
-    model: mujoco.MjModel | mjx.Model, geom1: np.ndarray | int, geom2: np.ndarray | int
-) -> Bool[np.ndarray, "..."]:
+def _is_static_pair(model: mujoco.MjModel | mjx.Model, geom1: np.ndarray, geom2: np.ndarray) -> Bool[np.ndarray, "..."]:
     """Whether neither geom of a pair can move."""
     bodies = [np.asarray(model.body_weldid)[np.asarray(model.geom_bodyid)[geom]] for geom in (geom1, geom2)]
     dofs = [np.asarray(model.body_dofnum)[body] for body in bodies]
@@ -38,9 +37,9 @@ def _moving_pairs(
 
     @functools.wraps(geom_pairs)
     def moving_pairs(model: mujoco.MjModel | mjx.Model) -> Iterator[tuple[int, int, int]]:
-        for geom1, geom2, pair in geom_pairs(model):
-            if not _is_static_pair(model, geom1, geom2):
-                yield geom1, geom2, pair
+        pairs = [*geom_pairs(model)]
+        geom1, geom2, _ = np.array(pairs, int).reshape(-1, 3).T
+        yield from itertools.compress(pairs, ~_is_static_pair(model, geom1, geom2))
 
     return moving_pairs
 
