@@ -130,6 +130,12 @@ _FEATURES = (
         'set cone="elliptic" in <option>, or condim="1" for contacts without friction',
     ),
     _Feature(
+        _MJX,  # Warp's result depends on the order of the contacts, which is by chance on a GPU
+        elements.option("noslip_iterations", lambda o: o.noslip_iterations > 0),
+        "the noslip solver as MuJoCo does",
+        "set noslip_iterations to 0 in <option>",
+    ),
+    _Feature(
         _MJX,
         elements.named("tendon", elements.unmoved_tendons),
         "a tendon with limits, friction or an equality that no joint moves in the model's own pose",
@@ -230,11 +236,5 @@ _FEATURES = (
         elements.named("geom", elements.fluid_geoms),
         "the fluid forces of individual geoms",
         "remove fluidshape and fluidcoef",
-    ),
-    _Feature(
-        ("jax",),
-        elements.option("noslip_iterations", lambda o: o.noslip_iterations > 0),
-        "the noslip solver",
-        "set noslip_iterations to 0 in <option>",
     ),
 )
