@@ -130,7 +130,7 @@ _FEATURES = (
         'set cone="elliptic" in <option>, or condim="1" for contacts without friction',
     ),
     _Feature(
-        _MJX,  # Warp's result depends on the order of the contacts, which is by chance on a GPU
+        _MJX,  # Warp's result depends on the order of the contacts, which is arbitrary on a GPU
         elements.option("noslip_iterations", lambda o: o.noslip_iterations > 0),
         "the noslip solver as MuJoCo does",
         "set noslip_iterations to 0 in <option>",

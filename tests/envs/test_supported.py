@@ -195,7 +195,7 @@ REFUSED = {
         {"option": 'density="500" viscosity=".5"', "shin": 'fluidshape="ellipsoid"'},
         "the fluid forces of individual geoms (geom 'shin')",
     ),
-    "noslip": (MJX, {"option": 'noslip_iterations="5"'}, "the noslip solver (noslip_iterations)"),
+    "noslip": (MJX, {"option": 'noslip_iterations="5"'}, "the noslip solver as MuJoCo does (noslip_iterations)"),
     "slidercrank": (
         JAX,
         {"motor": '<general cranksite="back" slidersite="tip" cranklength=".4" ctrlrange="-1 1"/>'},
