@@ -8,8 +8,8 @@ from pathlib import Path
 import imageio.v3 as iio
 
 import mjx_walk
+from mjx_walk.cli.parsing import stay_on_cpu
 from mjx_walk.envs import BUILT_IN_TASKS
-from mjx_walk.utils.cli import stay_on_cpu
 from mjx_walk.viewing.episode import record_episode
 
 TASKS = Path(__file__).parent / "tasks"

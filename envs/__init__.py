@@ -17,10 +17,10 @@ from mjx_walk.envs.state import NO_TIME_LIMIT, State, TrainableTask
 from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions, with_absolute_paths
 from mjx_walk.envs.view import View
-from mjx_walk.utils.compat import prepare_jax
+from mjx_walk.machine.compat import prepare_jax
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.near_misses import unknown
-from mjx_walk.utils.settings import validate
+from mjx_walk.utils.setting_fields import validate
 
 __all__ = [
     "BUILT_IN_TASKS",

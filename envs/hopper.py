@@ -14,7 +14,7 @@ from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
 from mjx_walk.envs.task_options import MAX_FRAME_SKIP
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 
 
 @dataclasses.dataclass

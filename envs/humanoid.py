@@ -11,7 +11,7 @@ from mjx_walk.envs.info import Info, plane_position, plane_velocity
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 
 
 @dataclasses.dataclass

@@ -14,7 +14,7 @@ from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.state import State
 from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 
 NUM_ROOT_DOFS = 6
 """Degrees of freedom of the root's free joint, which has no motor."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from mjx_walk.envs.state import State
 from mjx_walk.envs.task import Task
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 from mjx_walk.utils.types import ITERATION_COUNT, Metric, Metrics, PolicyFn, Reduction
 
 

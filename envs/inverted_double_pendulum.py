@@ -14,7 +14,7 @@ from mjx_walk.envs.state import Carry, State
 from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.envs.view import View
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 
 MAX_OBSERVED_VELOCITY = 10.0
 """Limit to which observed velocities are clipped, m/s and rad/s."""

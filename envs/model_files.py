@@ -9,7 +9,7 @@ from pathlib import Path
 
 import gymnasium
 
-from mjx_walk.utils.files import open_to_read, user_path
+from mjx_walk.storage.files import open_to_read, user_path
 
 __all__ = ["ASSETS", "absolute_xml_file", "changed_names", "is_asset", "model_path", "source_hashes"]
 

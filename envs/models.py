@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 
 from mjx_walk.envs.model_files import ASSETS, changed_names, model_path, source_hashes
+from mjx_walk.machine.quiet_mujoco import hide_deprecations, write_no_log
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.near_misses import near_misses
-from mjx_walk.utils.quiet_mujoco import hide_deprecations, write_no_log
 
 _LOGGER = logging.getLogger(__name__)
 

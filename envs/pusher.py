@@ -15,7 +15,7 @@ from mjx_walk.envs.state import Carry, State
 from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.envs.view import View
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 
 VELOCITY_NOISE = 5e-3
 """Limit of the uniform noise on the joint velocities of a reset, rad/s."""

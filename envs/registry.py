@@ -19,9 +19,9 @@ from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.envs.user_files import changed_file, load_from_file
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
+from mjx_walk.utils.class_checks import check_class, check_decorated
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.registration import check_class, check_decorated
-from mjx_walk.utils.settings import with_name
+from mjx_walk.utils.setting_fields import with_name
 
 __all__ = [
     "BUILT_IN_TASKS",

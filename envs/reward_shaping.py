@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 
 Terms = dict[str, Float[Array, ""]]
 """Signed reward terms by name, `[] f32` each."""

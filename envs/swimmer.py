@@ -15,7 +15,7 @@ from mjx_walk.envs.state import Carry, State
 from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import MAX_FRAME_SKIP, TaskOptions
 from mjx_walk.envs.view import View
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 
 
 @dataclasses.dataclass

@@ -21,7 +21,7 @@ from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape,
 from mjx_walk.envs.task_options import TaskOptions, check_version, with_absolute_paths
 from mjx_walk.envs.user_files import load_reward_function
 from mjx_walk.envs.view import View
-from mjx_walk.utils.compat import standard_dtypes
+from mjx_walk.machine.compat import standard_dtypes
 
 __all__ = ["Task"]
 

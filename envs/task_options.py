@@ -11,7 +11,7 @@ from mjx_walk.envs.reward_shaping import Shaping
 from mjx_walk.envs.state import NO_TIME_LIMIT
 from mjx_walk.envs.user_files import absolute_source
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 
 MAX_FRAME_SKIP = 10_000
 """With more, the physics of one environment step takes minutes and cannot be interrupted."""

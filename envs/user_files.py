@@ -13,8 +13,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from mjx_walk.storage.files import user_path
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import user_path
 
 __all__ = [
     "UserFile",

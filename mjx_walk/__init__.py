@@ -7,7 +7,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from mjx_walk.interop.registration import register
-from mjx_walk.utils.opengl import import_mujoco
+from mjx_walk.machine.opengl import import_mujoco
 from mjx_walk.utils.versions import __version__
 
 __all__ = [
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from mjx_walk.api import load_run, run
     from mjx_walk.envs import make_env, register_task
     from mjx_walk.interop.brax_env import BraxEnv
-    from mjx_walk.utils.compat import prepare_jax
+    from mjx_walk.machine.compat import prepare_jax
 
 _WHERE = {
     "BraxEnv": "mjx_walk.interop.brax_env",
     "load_run": "mjx_walk.api",
     "make_env": "mjx_walk.envs",
-    "prepare_jax": "mjx_walk.utils.compat",
+    "prepare_jax": "mjx_walk.machine.compat",
     "register_algorithm": "mjx_walk.algos",
     "register_task": "mjx_walk.envs",
     "run": "mjx_walk.api",

@@ -6,7 +6,7 @@ import importlib
 import sys
 from pathlib import Path
 
-from mjx_walk.utils.console import console
+from mjx_walk.cli.console import console
 from mjx_walk.utils.versions import __version__
 
 COMMANDS = ("train", "eval", "play", "plots", "export", "zoo", "compare", "bench", "parity")
@@ -38,11 +38,11 @@ def main() -> int:
     if command not in COMMANDS:
         with console():
             return _without_command(command)
-    from mjx_walk.utils import cli  # imports JAX, which the list of commands does not need
+    from mjx_walk.cli import parsing  # imports JAX, which the list of commands does not need
 
     module = importlib.import_module(f"mjx_walk.{_module(command)}")
     sys.argv = [f"mjx-walk {command}", *arguments]
-    cli.main(module.main)
+    parsing.main(module.main)
 
 
 def _without_command(command: str) -> int:

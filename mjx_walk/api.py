@@ -13,6 +13,7 @@ import yaml
 
 from mjx_walk import zoo
 from mjx_walk.algos import make_algorithm
+from mjx_walk.cli.parsing import refuse_flags
 from mjx_walk.envs import BUILT_IN_TASKS, Task, register_task
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.envs.registry import task_name
@@ -23,27 +24,26 @@ from mjx_walk.evaluation.gymnasium_scores import (
     score_in_gymnasium,
     score_in_sim,
 )
-from mjx_walk.runs.config import Config, load_config
-from mjx_walk.runs.loggers import require_wandb
-from mjx_walk.runs.metrics import Row, read_rows
-from mjx_walk.runs.overrides import key_of_value
-from mjx_walk.runs.own_tasks import KEY
-from mjx_walk.runs.policies import SavedPolicy, deterministic_policy, make_task
-from mjx_walk.runs.preparation import prepared
-from mjx_walk.runs.resuming import as_saved
-from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.saved_yaml import read_yaml
-from mjx_walk.runs.scores import BEST, Scores
-from mjx_walk.runs.trust import remember
+from mjx_walk.evaluation.saved_policies import SavedPolicy, deterministic_policy, make_task
+from mjx_walk.logs.loggers import require_wandb
+from mjx_walk.logs.metrics import Row, read_rows
+from mjx_walk.machine.compat import prepare_jax, standard_settings, temporary_jax_settings
+from mjx_walk.machine.signals import as_by_ctrl_c
+from mjx_walk.settings.config import Config, load_config
+from mjx_walk.settings.overrides import key_of_value
+from mjx_walk.settings.own_tasks import KEY
+from mjx_walk.settings.trust import remember
+from mjx_walk.storage.run_folder import RunFolder
+from mjx_walk.storage.saved_yaml import read_yaml
+from mjx_walk.storage.scores import BEST, Scores
 from mjx_walk.training.announcement import announce
 from mjx_walk.training.distributed import Processes
+from mjx_walk.training.folder_checks import prepared
 from mjx_walk.training.memory_check import check_replay
+from mjx_walk.training.resuming import as_saved
 from mjx_walk.training.trainer import Trainer
-from mjx_walk.utils.cli import refuse_flags
-from mjx_walk.utils.compat import prepare_jax, standard_settings, temporary_jax_settings
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import validate
-from mjx_walk.utils.signals import as_by_ctrl_c
+from mjx_walk.utils.setting_fields import validate
 from mjx_walk.viewing.rendering import choose_opengl
 
 __all__ = ["Run", "load_run", "resolve", "resolve_seeds", "run", "train"]

@@ -8,17 +8,17 @@ from typing import Any
 import jax
 
 from mjx_walk.api import resolve
+from mjx_walk.cli import parsing
+from mjx_walk.evaluation.saved_policies import make_task
 from mjx_walk.experiments import profile, scaling, timing
 from mjx_walk.experiments.timing import Measurement
-from mjx_walk.runs.config import Config
-from mjx_walk.runs.overrides import key_of_value
-from mjx_walk.runs.policies import make_task
+from mjx_walk.machine.devices import default_device
+from mjx_walk.settings.config import Config
+from mjx_walk.settings.overrides import key_of_value
+from mjx_walk.storage.files import user_path, write_text
 from mjx_walk.training import launcher
-from mjx_walk.utils import cli
-from mjx_walk.utils.devices import default_device
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import user_path, write_text
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 from mjx_walk.utils.versions import package_versions
 
 USAGE = """
@@ -47,14 +47,14 @@ class Arguments:
 
 def main(command_line: list[str]) -> None:
     """Measure, print a table, and write JSON if asked."""
-    arguments, overrides = cli.parse_own(Arguments, Config, command_line, USAGE, key_of_value)
+    arguments, overrides = parsing.parse_own(Arguments, Config, command_line, USAGE, key_of_value)
     config = resolve(overrides)
     algo = config.algo.name
     if arguments.peers and algo not in ("ppo", "sac"):
         raise UserError(f"Brax has no {algo} to compare with; omit peers, or choose algo=ppo or algo=sac")
     jax.config.update("jax_default_matmul_precision", config.matmul_precision)
     if arguments.out:
-        cli.check_writable(user_path(arguments.out))
+        parsing.check_writable(user_path(arguments.out))
     sizes = device_counts(arguments.devices)
     print("Short training runs in child processes …", flush=True)
     # They run first, before this process allocates the device's memory.
@@ -100,4 +100,4 @@ def device_counts(asked: Any) -> list[int]:
 
 
 if __name__ == "__main__":
-    cli.main(main)
+    parsing.main(main)

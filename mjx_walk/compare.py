@@ -11,18 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from mjx_walk.algos import ALGORITHMS
+from mjx_walk.cli import parsing
 from mjx_walk.experiments import planned_runs
 from mjx_walk.experiments.planned_runs import PlannedRun
 from mjx_walk.experiments.suite import SUITES, plan_suite, write_report
-from mjx_walk.runs.config import Config
-from mjx_walk.runs.overrides import key_of_value
-from mjx_walk.utils import cli
-from mjx_walk.utils.devices import count_devices
+from mjx_walk.machine.devices import count_devices
+from mjx_walk.machine.nvidia import warn_of_unused_gpu
+from mjx_walk.machine.signals import exit_code
+from mjx_walk.settings.config import Config
+from mjx_walk.settings.overrides import key_of_value
+from mjx_walk.storage.files import user_path
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import user_path
-from mjx_walk.utils.nvidia import warn_of_unused_gpu
-from mjx_walk.utils.settings import setting
-from mjx_walk.utils.signals import exit_code
+from mjx_walk.utils.setting_fields import setting
 
 USAGE = """
 usage: python -m mjx_walk.compare [env=ENV|suite=mujoco] ['algos=[ppo,sac,td3]'] [seeds=3] [out=DIR] [KEY=VALUE ...]
@@ -59,7 +59,7 @@ class Arguments:
 
 def main(command_line: list[str]) -> int:
     """Train the runs that are not finished, and draw all. Returns the exit code."""
-    arguments, overrides = cli.parse_own(Arguments, Config, command_line, USAGE, key_of_value)
+    arguments, overrides = parsing.parse_own(Arguments, Config, command_line, USAGE, key_of_value)
     if arguments.draw:
         if arguments.out is None:
             raise UserError("say which runs to draw: out=DIR")
@@ -69,7 +69,7 @@ def main(command_line: list[str]) -> int:
         raise UserError(f"algos=[]: choose some of: {', '.join(ALGORITHMS)}")
     if arguments.out is not None and user_path(arguments.out).is_file():
         raise UserError(f"out={arguments.out} is a file; give a folder")
-    seeds = cli.read_seeds(arguments.seeds)
+    seeds = parsing.read_seeds(arguments.seeds)
     hardware, available = count_devices()
     if hardware == "cpu":
         warn_of_unused_gpu()
@@ -134,4 +134,4 @@ def _print_report(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    cli.main(main)
+    parsing.main(main)

@@ -5,14 +5,14 @@ import warnings
 
 from mjx_walk import zoo
 from mjx_walk.api import Run, load_run
-from mjx_walk.runs.own_tasks import take_task
-from mjx_walk.runs.policies import default_policy, kept_policies
-from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.scores import POLICIES, Scores, read_scores, write_scores
+from mjx_walk.cli import parsing
+from mjx_walk.evaluation.saved_policies import default_policy, kept_policies
+from mjx_walk.settings.own_tasks import take_task
+from mjx_walk.storage.run_folder import RunFolder
+from mjx_walk.storage.scores import POLICIES, Scores, read_scores, write_scores
 from mjx_walk.training.summary import choice_line, score_lines
-from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import MAX_SEED, setting
+from mjx_walk.utils.setting_fields import MAX_SEED, setting
 
 USAGE = """
 usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [policy=final|best] [episodes=100] [backend=gymnasium|sim] [seed=0]
@@ -40,7 +40,7 @@ class Arguments:
 
 def main(command_line: list[str]) -> None:
     """Score the policy, print the result, and save a Gymnasium score in the run folder."""
-    arguments = cli.parse(Arguments, take_task(command_line), USAGE)
+    arguments = parsing.parse(Arguments, take_task(command_line), USAGE)
     if arguments.physics and arguments.backend == "gymnasium":
         raise UserError(f"physics={arguments.physics} needs backend=sim: Gymnasium has its own engine")
     folder = zoo.open_run(arguments.run)
@@ -48,7 +48,7 @@ def main(command_line: list[str]) -> None:
     run = load_run(folder.path, arguments.physics, name)
     is_saved = arguments.backend == "gymnasium" and not zoo.holds(folder.path)
     if is_saved:
-        cli.check_writable(folder.gymnasium_scores)
+        parsing.check_writable(folder.gymnasium_scores)
     scores = run.evaluate(arguments.episodes, arguments.backend, arguments.seed)
     print(*score_lines({run.policy_name: (scores, run.policy_facts["env_steps"])}))
     if arguments.policy is None and len(kept_policies(folder)) > 1:
@@ -71,4 +71,4 @@ def _save(folder: RunFolder, run: Run, scores: Scores) -> None:
 
 
 if __name__ == "__main__":
-    cli.main(main)
+    parsing.main(main)

@@ -4,14 +4,14 @@ import dataclasses
 
 from mjx_walk import zoo
 from mjx_walk.api import load_run
-from mjx_walk.runs.own_tasks import take_task
-from mjx_walk.runs.policies import kept_policies
-from mjx_walk.runs.scores import BEST, POLICIES
+from mjx_walk.cli import parsing
+from mjx_walk.evaluation.saved_policies import kept_policies
+from mjx_walk.settings.own_tasks import take_task
+from mjx_walk.storage.files import replacing, user_path
+from mjx_walk.storage.scores import BEST, POLICIES
 from mjx_walk.training.summary import choice_line
-from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import replacing, user_path
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 
 USAGE = """
 usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [format=onnx] [dtype=float64|float32]
@@ -38,8 +38,8 @@ class Arguments:
 
 def main(command_line: list[str]) -> None:
     """Write the file."""
-    arguments = cli.parse(Arguments, take_task(command_line), USAGE)
-    cli.stay_on_cpu()
+    arguments = parsing.parse(Arguments, take_task(command_line), USAGE)
+    parsing.stay_on_cpu()
     folder = zoo.open_run(arguments.run)
     try:
         import onnx
@@ -48,8 +48,8 @@ def main(command_line: list[str]) -> None:
     except ImportError as error:
         raise UserError("format=onnx needs ONNX: pip install onnx") from error
     path = user_path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.onnx")
-    cli.check_suffix(path, ".onnx")
-    cli.check_writable(path)
+    parsing.check_suffix(path, ".onnx")
+    parsing.check_writable(path)
     run = load_run(folder.path, "c", arguments.policy or BEST)
     name = f"{run.config.env.name}_{run.config.algo.name}"
     model = translate(run.act, run.task.observation_size, name, arguments.dtype)
@@ -62,4 +62,4 @@ def main(command_line: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    cli.main(main)
+    parsing.main(main)

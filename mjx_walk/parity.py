@@ -4,12 +4,12 @@ import dataclasses
 import sys
 import warnings
 
+from mjx_walk.cli import parsing
 from mjx_walk.envs import TASKS, make_env
-from mjx_walk.evaluation.parity import check
+from mjx_walk.evaluation.engine_parity import check
 from mjx_walk.evaluation.random_steps import take_random_steps
-from mjx_walk.utils import cli
-from mjx_walk.utils.devices import default_device
-from mjx_walk.utils.settings import MAX_SEED, setting
+from mjx_walk.machine.devices import default_device
+from mjx_walk.utils.setting_fields import MAX_SEED, setting
 
 USAGE = """
 usage: python -m mjx_walk.parity [physics=warp|jax] [env=all] [version=v5] [num_envs=32] [steps=60] [seed=0]
@@ -36,7 +36,7 @@ class Arguments:
 
 def main(command_line: list[str]) -> int:
     """Print a table for each task. Returns 1 if an error exceeds its tolerance."""
-    arguments = cli.parse(Arguments, [_with_present_name(argument) for argument in command_line], USAGE)
+    arguments = parsing.parse(Arguments, [_with_present_name(argument) for argument in command_line], USAGE)
     is_within = True
     one = _random_steps if arguments.random_steps else _single_steps
     every = [name for name, (task, _) in TASKS.items() if arguments.version in task.XML_FILES]
@@ -79,4 +79,4 @@ def _with_present_name(argument: str) -> str:
 
 
 if __name__ == "__main__":
-    cli.main(main)
+    parsing.main(main)

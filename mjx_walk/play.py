@@ -6,12 +6,12 @@ import imageio.v3 as iio
 
 from mjx_walk import zoo
 from mjx_walk.api import load_run
-from mjx_walk.runs.own_tasks import take_task
-from mjx_walk.runs.scores import BEST, POLICIES
-from mjx_walk.utils import cli
+from mjx_walk.cli import parsing
+from mjx_walk.settings.own_tasks import take_task
+from mjx_walk.storage.files import replacing, user_path
+from mjx_walk.storage.scores import BEST, POLICIES
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import replacing, user_path
-from mjx_walk.utils.settings import MAX_SEED, setting
+from mjx_walk.utils.setting_fields import MAX_SEED, setting
 from mjx_walk.viewing.episode import record_episode
 from mjx_walk.viewing.gait import draw_gait_sheet, frame_strip
 from mjx_walk.viewing.page import require_library, write_page
@@ -58,8 +58,8 @@ class Arguments:
 
 def main(command_line: list[str]) -> None:
     """Play an episode, and write the files that the arguments name."""
-    arguments = cli.parse(Arguments, take_task(command_line), USAGE)
-    cli.stay_on_cpu()
+    arguments = parsing.parse(Arguments, take_task(command_line), USAGE)
+    parsing.stay_on_cpu()
     folder = zoo.open_run(arguments.run)
     for key in ("start", "seconds"):
         if getattr(arguments, key) is not None and arguments.strip is None:
@@ -70,13 +70,13 @@ def main(command_line: list[str]) -> None:
     film, html, gait, strip = (user_path(path) if path else None for path in paths)
     if not (any(paths) or arguments.viewer):
         film = zoo.output_path(folder, "episode.mp4")
-    cli.check_suffix(film, ".mp4", ".mkv", ".mov", ".avi")
-    cli.check_suffix(html, ".html", ".htm")
+    parsing.check_suffix(film, ".mp4", ".mkv", ".mov", ".avi")
+    parsing.check_suffix(html, ".html", ".htm")
     for image in (gait, strip):
-        cli.check_suffix(image, ".png", ".jpg")
+        parsing.check_suffix(image, ".png", ".jpg")
     written = [path for path in (film, html, gait, strip) if path]
     for path in written:
-        cli.check_writable(path)
+        parsing.check_writable(path)
     run = load_run(folder.path, "c", arguments.policy)
     if written:
         size = None if written == [html] else (arguments.width, arguments.height)
@@ -116,4 +116,4 @@ def _shown(arguments: Arguments, length: float) -> tuple[float, float]:
 
 
 if __name__ == "__main__":
-    cli.main(main)
+    parsing.main(main)

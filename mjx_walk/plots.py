@@ -3,7 +3,7 @@
 import dataclasses
 
 from mjx_walk import zoo
-from mjx_walk.utils import cli
+from mjx_walk.cli import parsing
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.run_plots import plot_run
 
@@ -21,7 +21,7 @@ class Arguments:
 
 def main(command_line: list[str]) -> None:
     """Draw the curves, and print the files written."""
-    folder = zoo.open_run(cli.parse(Arguments, command_line, USAGE).run)
+    folder = zoo.open_run(parsing.parse(Arguments, command_line, USAGE).run)
     written = plot_run(folder)
     if not written:
         reason = "the zoo keeps no metrics" if zoo.holds(folder.path) else "it has not logged any metrics yet"
@@ -30,4 +30,4 @@ def main(command_line: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    cli.main(main)
+    parsing.main(main)

@@ -19,8 +19,10 @@ from omegaconf import DictConfig, open_dict
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.api import resolve, resolve_seeds, train
+from mjx_walk.cli import parsing
 from mjx_walk.envs import TASKS
-from mjx_walk.runs.config import (
+from mjx_walk.machine.signals import Stopped, exit_code
+from mjx_walk.settings.config import (
     CONFIG_DIR,
     Config,
     compose_config,
@@ -28,19 +30,17 @@ from mjx_walk.runs.config import (
     to_config,
     with_absolute_paths,
 )
-from mjx_walk.runs.inputs import check_inputs
-from mjx_walk.runs.overrides import complete_overrides, key_of_value
-from mjx_walk.runs.own_hydra import own_hydra
-from mjx_walk.runs.recipe_files import with_stored_recipes
-from mjx_walk.runs.renamed import present_overrides
-from mjx_walk.runs.run_folder import RunFolder, new_folder
+from mjx_walk.settings.input_files import check_inputs
+from mjx_walk.settings.overrides import complete_overrides, key_of_value
+from mjx_walk.settings.own_hydra import own_hydra
+from mjx_walk.settings.recipe_files import with_stored_recipes
+from mjx_walk.settings.renamed import present_overrides
+from mjx_walk.storage.files import user_path
+from mjx_walk.storage.run_folder import RunFolder, new_folder
 from mjx_walk.training import launcher
 from mjx_walk.training.distributed import Processes, join_processes
-from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import user_path
-from mjx_walk.utils.settings import describe, meanings, refuse_ineffective, table
-from mjx_walk.utils.signals import Stopped, exit_code
+from mjx_walk.utils.setting_fields import describe, meanings, refuse_ineffective, table
 
 _NAMES = textwrap.fill(
     f"env={'|'.join(TASKS)}".replace("|", " | "), 100, initial_indent="  ", subsequent_indent="      "
@@ -86,7 +86,7 @@ def main(arguments: list[str]) -> int:
     if any(argument.startswith("-") for argument in arguments):
         _through_hydra(arguments)
         return 0
-    own, overrides = cli.parse_own(Own, Config, arguments, USAGE, key_of_value)
+    own, overrides = parsing.parse_own(Own, Config, arguments, USAGE, key_of_value)
     overrides = present_overrides(overrides)
     if own.seeds is not None and own.devices is not None:
         raise UserError("give seeds=… or devices=…, not both")
@@ -98,7 +98,7 @@ def main(arguments: list[str]) -> int:
         if count > 1:
             resolve(overrides)  # reports invalid settings once instead of once per process
             return launcher.run([f"devices={own.devices}", *overrides], count)
-    configs = resolve_seeds(overrides, cli.read_seeds(own.seeds)) if own.seeds is not None else [resolve(overrides)]
+    configs = resolve_seeds(overrides, parsing.read_seeds(own.seeds)) if own.seeds is not None else [resolve(overrides)]
     _, signal_name = train(configs)
     return exit_code(signal_name) if signal_name else 0
 
@@ -168,7 +168,7 @@ def _through_hydra(arguments: list[str]) -> None:
         UserError: Hydra refuses the arguments.
     """
     hints = typing.get_type_hints(Config) | typing.get_type_hints(Own)
-    cli.refuse_flags(_without_hydras(arguments), key_of_value, hints)
+    parsing.refuse_flags(_without_hydras(arguments), key_of_value, hints)
     _check_cfg(arguments)
     given = [a for a in arguments if not a.startswith("-") and ("=" in a or a.startswith(("+", "~")))]
     flags = [argument for argument in arguments if argument not in given]
@@ -232,4 +232,4 @@ def _sweep_job(node: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    cli.main(main)
+    parsing.main(main)

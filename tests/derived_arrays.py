@@ -21,7 +21,7 @@ from rich_model import FIXED, FORCE_SENSORS, NOT_ON_MJX, SENSORS, SPATIAL, SUBTR
 from mjx_walk.envs import models
 from mjx_walk.envs.physics import PhysicsState, make_engine
 from mjx_walk.envs.physics.derived_arrays import LATE_ARRAYS, refuse_derived
-from mjx_walk.utils.compat import prepare_jax
+from mjx_walk.machine.compat import prepare_jax
 from mjx_walk.utils.errors import UserError
 
 ENGINES = ("c", "jax", "warp")

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from helpers import ENVIRONMENT, TINY, TINY_OFF_POLICY, saved_leaves
 
-from mjx_walk.runs import checkpoint
-from mjx_walk.runs.scores import POLICIES
+from mjx_walk.storage import checkpoint
+from mjx_walk.storage.scores import POLICIES
 
 HANG = 180.0
 """Seconds after which a command counts as hanging."""

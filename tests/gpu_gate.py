@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from helpers import CLONE, kill_after
 
-from mjx_walk.runs.metrics import read_rows
+from mjx_walk.logs.metrics import read_rows
 
 _NOT_FOR_USERS = ("JAX_PLATFORMS", "XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR", "XDG_CONFIG_HOME")
 """Variables by which `conftest` makes tests run on a CPU, compile quickly and leave the user's files alone."""

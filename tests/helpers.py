@@ -21,10 +21,10 @@ from shared_programs import shared_programs
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.envs import registry
-from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import load_config
-from mjx_walk.runs.facts import read_facts, write_facts
-from mjx_walk.runs.saved_config import save_config
+from mjx_walk.settings.config import load_config
+from mjx_walk.settings.saved_config import save_config
+from mjx_walk.storage import checkpoint
+from mjx_walk.storage.checkpoint_metadata import read_facts, write_facts
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing import rendering
 

@@ -8,7 +8,7 @@ import pytest
 
 from mjx_walk.algos import make_algorithm
 from mjx_walk.envs import BUILT_IN_TASKS
-from mjx_walk.runs.policies import make_task
+from mjx_walk.evaluation.saved_policies import make_task
 from mjx_walk.training.programs import make_seeds_program, make_single_program
 
 _MADE: dict[Any, Any] = {}

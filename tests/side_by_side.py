@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 
 import mjx_walk  # noqa: F401  registers the names
-from mjx_walk.utils.quiet_mujoco import hide_deprecations
+from mjx_walk.machine.quiet_mujoco import hide_deprecations
 
 REGISTERED = [name for name in gymnasium.registry if name.startswith("mjx_walk/")]
 IDS = [name.removeprefix("mjx_walk/") for name in REGISTERED if name != "mjx_walk/Pusher-v4"]

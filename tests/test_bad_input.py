@@ -15,10 +15,10 @@ from mjx_walk import compare as compare_command
 from mjx_walk import eval as eval_command
 from mjx_walk import train as train_command
 from mjx_walk.algos import ALGORITHMS
+from mjx_walk.cli import parsing
 from mjx_walk.envs import TASKS
-from mjx_walk.runs import run_folder
-from mjx_walk.runs.config import Config, flatten, load_config
-from mjx_walk.utils import cli
+from mjx_walk.settings.config import Config, flatten, load_config
+from mjx_walk.storage import run_folder
 from mjx_walk.utils.errors import UserError
 
 CASES = [
@@ -146,7 +146,7 @@ def test_no_setting_is_taken_for_a_command_s_own(command):
     own = {field.name for field in dataclasses.fields(command)}
     for env, algo in [*((env, "ppo") for env in TASKS), *(("humanoid", algo) for algo in ALGORITHMS)]:
         settings = [f"{key}=1" for key in flatten(load_config([f"env={env}", f"algo={algo}"])) if key not in own]
-        assert cli.parse_own(command, Config, settings, "")[1] == settings
+        assert parsing.parse_own(command, Config, settings, "")[1] == settings
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
@@ -155,16 +155,16 @@ def test_a_disk_that_takes_nothing_costs_one_line(number, monkeypatch, capsys):
         raise OSError(number, os.strerror(number), "some/file")
 
     with pytest.raises(SystemExit) as ended:
-        cli.main(fail)
+        parsing.main(fail)
     assert ended.value.code == 2
     assert capsys.readouterr().err == f"error: [Errno {number}] {os.strerror(number)}: 'some/file'\n"
 
 
 def test_what_can_be_written_is_not_left_behind(tmp_path):
-    cli.check_writable(tmp_path / "new" / "file")
+    parsing.check_writable(tmp_path / "new" / "file")
     assert list((tmp_path / "new").iterdir()) == []
     (tmp_path / "old").write_text("x")
-    cli.check_writable(tmp_path / "old")
+    parsing.check_writable(tmp_path / "old")
     assert (tmp_path / "old").read_text() == "x"
 
 

@@ -15,11 +15,11 @@ from mjx_walk.experiments import scaling, timing
 from mjx_walk.experiments.program_costs import matmul_flops, reduced_bytes
 from mjx_walk.experiments.recorded_time import read_device_time
 from mjx_walk.experiments.scaling import share_of_total
-from mjx_walk.runs.config import load_config
+from mjx_walk.machine.subprocesses import start_module
+from mjx_walk.settings.config import load_config
 from mjx_walk.training.call_profile import CallProfile
 from mjx_walk.utils import collectives
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.subprocesses import start_module
 
 
 @pytest.mark.slow

@@ -11,13 +11,14 @@ from helpers import TINY, TINY_OFF_POLICY, train_here
 
 from mjx_walk import api
 from mjx_walk.algos import make_algorithm
-from mjx_walk.runs import checkpoint, policies
-from mjx_walk.runs.metrics import read_rows
-from mjx_walk.runs.preparation import prepared
-from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.saved_config import MAY_DIFFER, differences
-from mjx_walk.runs.scores import POLICIES, read_scores
+from mjx_walk.evaluation import saved_policies
+from mjx_walk.logs.metrics import read_rows
+from mjx_walk.settings.saved_config import MAY_DIFFER, differences
+from mjx_walk.storage import checkpoint
+from mjx_walk.storage.run_folder import RunFolder
+from mjx_walk.storage.scores import POLICIES, read_scores
 from mjx_walk.training.distributed import Processes
+from mjx_walk.training.folder_checks import prepared
 from mjx_walk.training.recorder import Recorder
 from mjx_walk.utils.errors import UserError
 
@@ -30,7 +31,7 @@ class Examiner:
     def __init__(self, run_dir):
         self.source = run_dir
         self.config = self.resolve(run_dir)
-        self.task = policies.make_task(self.config)
+        self.task = saved_policies.make_task(self.config)
         config = self.config
         self.algorithm = make_algorithm(self.task, config.num_envs, config.evaluation, config.algo)
         self.like = jax.eval_shape(self.algorithm.init, jax.random.PRNGKey(0))
@@ -38,7 +39,7 @@ class Examiner:
         for path in checkpoint.list_steps(run_dir / "checkpoints"):
             self.states[int(path.name)] = jax.device_get(checkpoint.restore(path, self.like)[0])
         self.rows = read_rows(run_dir / "metrics.jsonl")
-        self.policies = {name: policies._load(RunFolder(run_dir), name, self.algorithm) for name in POLICIES}
+        self.policies = {name: saved_policies._load(RunFolder(run_dir), name, self.algorithm) for name in POLICIES}
         self.scores = read_scores(run_dir / "eval_gymnasium.json")
 
     def resolve(self, run_dir):
@@ -58,7 +59,7 @@ class Examiner:
         found += [] if _same(state, self.states[facts["env_steps"]]) else ["another state"]
         found += [] if read_rows(run_dir / "metrics.jsonl") == self.rows else ["other rows"]
         for name, (params, policy_facts) in self.policies.items():
-            other = policies._load(folders[0], policies.choose_policy(folders[0], name), self.algorithm)
+            other = saved_policies._load(folders[0], saved_policies.choose_policy(folders[0], name), self.algorithm)
             found += [] if _same(other[0], params) and other[1] == policy_facts else [f"another {name} policy"]
         return found
 

@@ -10,7 +10,7 @@ from helpers import CLONE
 
 from mjx_walk.algos import BUILT_IN_ALGORITHMS
 from mjx_walk.envs import BUILT_IN_TASKS, TASKS
-from mjx_walk.utils import settings
+from mjx_walk.utils import setting_fields
 
 DOCS = CLONE / "docs"
 
@@ -44,8 +44,8 @@ def test_every_setting_has_a_meaning():
     schemas = importlib.import_module("generator.setting_tables").all_schemas()
     assert len(schemas) == 5 + len(BUILT_IN_TASKS) + len(BUILT_IN_ALGORITHMS)
     for schema in schemas:
-        meanings = settings.meanings(schema)
-        missing = {row.name for row in settings.table(schema)} - {*meanings, "name", "env", "algo"}
+        meanings = setting_fields.meanings(schema)
+        missing = {row.name for row in setting_fields.table(schema)} - {*meanings, "name", "env", "algo"}
         assert not missing, schema.__name__
         assert all(meaning.endswith(".") for meaning in meanings.values())
 

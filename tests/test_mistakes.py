@@ -15,10 +15,10 @@ from helpers import OLD_RUNS, renders
 
 import mjx_walk
 from mjx_walk import compare, play, zoo
+from mjx_walk.cli import parsing
 from mjx_walk.envs import TASKS
-from mjx_walk.runs.config import load_config
+from mjx_walk.settings.config import load_config
 from mjx_walk.training import launcher
-from mjx_walk.utils import cli
 from mjx_walk.utils.errors import UserError
 
 TABLES = Path(__file__).parent / "mistakes"
@@ -76,7 +76,7 @@ def check_line(module, arguments, message, monkeypatch, capsys):
     main = importlib.import_module(f"mjx_walk.{module}").main
     monkeypatch.setattr(sys, "argv", ["command", *arguments])
     with pytest.raises(SystemExit) as ended:
-        cli.main(main)
+        parsing.main(main)
     captured = capsys.readouterr()
     assert captured.err == f"error: {message}\n" and captured.out == ""
     assert ended.value.code == 2
@@ -121,4 +121,4 @@ def test_there_are_many():
 def test_whole_numbers_are_integers():
     config = load_config(["total_steps=1e5", "num_envs=64.0", "seed=1e1", "algo.num_epochs=1_0e0"])
     assert (config.total_steps, config.num_envs, config.seed, config.algo.num_epochs) == (100_000, 64, 10, 10)
-    assert cli.parse(compare.Arguments, ["together=2.0"], "").together == 2
+    assert parsing.parse(compare.Arguments, ["together=2.0"], "").together == 2

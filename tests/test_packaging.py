@@ -22,7 +22,7 @@ CLONE = Path(__file__).parent.parent
 USE = """
 import mjx_walk, sys
 assert "jax" not in sys.modules, "import mjx_walk should be light"
-from mjx_walk.runs.config import load_config
+from mjx_walk.settings.config import load_config
 from mjx_walk.envs import TASKS
 assert load_config(["env=walker2d"]).num_envs == 64
 env = mjx_walk.make_env("walker2d", physics="c")
@@ -184,7 +184,7 @@ def test_mjx_is_imported_without_searches_for_garbage():
         import gc, mjx_walk
         searches = []
         gc.callbacks.append(lambda phase, _: searches.append(phase))
-        from mjx_walk.utils import quiet_mjx
+        from mjx_walk.machine import quiet_mjx
         print(gc.isenabled(), len(searches) <= 2)  # one, once they are allowed again
     """
     assert printed(code) == "True True\n"
@@ -192,5 +192,5 @@ def test_mjx_is_imported_without_searches_for_garbage():
 
 def test_tensorboard_does_not_import_pytorch(tmp_path):
     (tmp_path / "torch.py").write_text("print('PyTorch')\nclass Tensor: ...")
-    code = "import mjx_walk.runs.tensorboard; print('TensorBoard'); import torch"
+    code = "import mjx_walk.logs.tensorboard; print('TensorBoard'); import torch"
     assert printed(code, tmp_path) == "TensorBoard\nPyTorch\n"

@@ -30,7 +30,7 @@ from mjx_walk import zoo
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.envs import make_env
 from mjx_walk.experiments import planned_runs
-from mjx_walk.runs.config import load_config
+from mjx_walk.settings.config import load_config
 from mjx_walk.training.trainer import Trainer
 
 RESULTS = (CLONE / "docs" / "results.md").read_text()
@@ -176,7 +176,7 @@ OWN_PROCESS = r"train .*devices="
 """Commands that run in a process of their own. The tests' process, which runs the others, has the imports already."""
 
 TRAINED_ELSEWHERE = {
-    r"train env=humanoid algo=\w+$": "runs/test_old_runs.py",
+    r"train env=humanoid algo=\w+$": "storage/test_old_runs.py",
     r"train .*\bseeds=": "training/test_seeds.py",
     r"train -m ": "test_train.py",
 }

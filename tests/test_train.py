@@ -18,7 +18,7 @@ from mjx_walk import train as train_command
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import make_env
 from mjx_walk.training import trainer
-from mjx_walk.utils import settings
+from mjx_walk.utils import setting_fields
 from mjx_walk.utils.errors import UserError
 
 
@@ -210,8 +210,8 @@ def test_help_says_what_the_settings_of_an_algorithm_mean(algo, capsys):
     assert train_command.main(["--help", f"algo={algo}"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     schema = ALGORITHMS[algo][1]
-    for row in settings.table(schema):
-        assert f"algo.{row.name}=" in shown and settings.meanings(schema)[row.name] in shown
+    for row in setting_fields.table(schema):
+        assert f"algo.{row.name}=" in shown and setting_fields.meanings(schema)[row.name] in shown
 
 
 @pytest.mark.parametrize("arguments", [["env=walker2d", "--cfg", "job"], ["algo=sac", "--cfg", "job", "env=walker2d"]])

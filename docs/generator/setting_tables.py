@@ -6,8 +6,8 @@ from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.reward_shaping import Shaping
 from mjx_walk.envs.task_options import TaskOptions
-from mjx_walk.runs.config import CheckpointConfig, Config
-from mjx_walk.utils import settings
+from mjx_walk.settings.config import CheckpointConfig, Config
+from mjx_walk.utils import setting_fields
 
 GROUPS = {
     "run": (Config, ""),
@@ -26,8 +26,8 @@ def settings_table(schema: type, prefix: str) -> str:
         schema: the dataclass.
         prefix: start of the full keys, such as `algo.`.
     """
-    meanings = settings.meanings(schema)
-    given = [row for row in settings.table(schema) if row.name not in ("name", "env", "algo")]
+    meanings = setting_fields.meanings(schema)
+    given = [row for row in setting_fields.table(schema) if row.name not in ("name", "env", "algo")]
     rows = []
     for row in given:
         conditions = " or ".join(map(_condition, row.condition.split(" or "))) if row.condition else ""

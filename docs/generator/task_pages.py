@@ -10,7 +10,7 @@ from generator.setting_tables import GROUPS, settings_table
 from generator.task_texts import TEXTS, TaskText
 from mjx_walk import zoo
 from mjx_walk.envs import TASKS, Task, make_env
-from mjx_walk.utils import settings
+from mjx_walk.utils import setting_fields
 
 
 def page(name: str) -> str:
@@ -130,7 +130,7 @@ def _episodes(task: Task, text: TaskText) -> str:
 def _options(name: str) -> str:
     kind, schema = TASKS[name]
     common = {field.name for field in dataclasses.fields(GROUPS["task"][0])}
-    own = [row.name for row in settings.table(schema) if row.name not in common or row.name in _DEFAULTS_DIFFER]
+    own = [row.name for row in setting_fields.table(schema) if row.name not in common or row.name in _DEFAULTS_DIFFER]
     lines = settings_table(schema, "env.").splitlines()
     kept = [line for line in lines[2:] if line.split("`")[1].removeprefix("env.") in own]
     exclusive = [*((option, "v5") for option in kind.V5_ONLY), *((option, "v4") for option in kind.V4_ONLY)]

@@ -14,9 +14,9 @@ from mjx_walk.envs.physics.base import Derived, Engine, PhysicsState
 from mjx_walk.envs.physics.derived_arrays import refuse_derived
 from mjx_walk.envs.physics.preparation import nothing_runs
 from mjx_walk.envs.physics.supported import refuse_unsupported, unsupported_by_mjx
-from mjx_walk.utils.devices import default_backend, default_device
+from mjx_walk.machine.devices import default_backend, default_device
+from mjx_walk.machine.nvidia import Machine, installed_version, warn_of_unused_gpu, warp_misfit
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.nvidia import Machine, installed_version, warn_of_unused_gpu, warp_misfit
 
 ENGINES = ("warp", "jax", "c")
 
@@ -94,7 +94,7 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
 
 
 def _make_mjx_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Engine:
-    from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
+    from mjx_walk.machine import quiet_mjx  # noqa: F401  # isort: skip
     from mjx_walk.envs.physics.mjx_model import MIN_SOLVER_ITERATIONS
 
     warn_of_approximations(model, name, MIN_SOLVER_ITERATIONS)

@@ -11,7 +11,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Bool, Float
 
 from mjx_walk.envs.physics.preparation import Preparation
-from mjx_walk.utils.compat import standard_dtypes
+from mjx_walk.machine.compat import standard_dtypes
 
 Derived = dict[str, Array]
 """MuJoCo arrays by their `mjData` names, for example `cinert`, `[nbody, 10] f32`."""

@@ -131,7 +131,7 @@ def slippery_contacts(model: mujoco.MjModel) -> Iterator[str]:
 
 def pairs_that_move(model: mujoco.MjModel) -> tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, " n"]]:
     """Pairs of geoms that may touch, of which at least one moves, and the indices of their `<pair>`, or -1."""
-    from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
+    from mjx_walk.machine import quiet_mjx  # noqa: F401  # isort: skip
     from mujoco.mjx._src import collision_driver
 
     is_off = model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)

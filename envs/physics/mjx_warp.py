@@ -20,7 +20,7 @@ from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
 from mjx_walk.envs.physics.preparation import Preparation
 from mjx_walk.envs.physics.static_pairs import drop_static_pairs
 from mjx_walk.envs.physics.warp_kernels import choose_cache, load_kernels
-from mjx_walk.utils.devices import default_device
+from mjx_walk.machine.devices import default_device
 
 CONTACTS_PER_ENV = 40
 """Mean capacity per environment for candidate geom pairs, and for contacts. The batch shares both buffers.

@@ -20,7 +20,7 @@ import mujoco
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
 
-from mjx_walk.utils.files import is_writable_folder, user_folder
+from mjx_walk.storage.files import is_writable_folder, user_folder
 
 _log = logging.getLogger("mjx_walk.progress")
 

@@ -5,7 +5,7 @@ Networks, returns, replay and optimizers that they share are in `mjx_walk.common
 
 from typing import Any
 
-from mjx_walk.utils import quiet_mjx  # noqa: F401  # isort: skip
+from mjx_walk.machine import quiet_mjx  # noqa: F401  # isort: skip
 from mjx_walk.algos.a2c import A2C, A2CConfig
 from mjx_walk.algos.base import Algorithm, TrainState, is_finite, learned_leaves, without_replay
 from mjx_walk.algos.csac import CSAC, CSACConfig
@@ -18,9 +18,9 @@ from mjx_walk.algos.sac import SAC, SACConfig
 from mjx_walk.algos.td3 import TD3, TD3Config
 from mjx_walk.envs import Task
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.utils.class_checks import check_class, check_decorated
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.registration import check_class, check_decorated
-from mjx_walk.utils.settings import with_name
+from mjx_walk.utils.setting_fields import with_name
 
 ALGORITHMS: dict[str, tuple[type[Algorithm], type]] = {
     "ppo": (PPO, PPOConfig),

@@ -10,7 +10,7 @@ from mjx_walk.algos.on_policy import OnPolicyBatch, OnPolicyState
 from mjx_walk.algos.policy_gradient import PolicyGradientAlgorithm, PolicyGradientConfig, Samples, normalize
 from mjx_walk.common.brax_losses import PPOParams, compute_gae
 from mjx_walk.common.exploration import Exploration, NoExploration, OrnsteinUhlenbeck
-from mjx_walk.utils.settings import AnyBut, setting
+from mjx_walk.utils.setting_fields import AnyBut, setting
 
 
 @dataclasses.dataclass

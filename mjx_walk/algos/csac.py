@@ -16,7 +16,7 @@ from mjx_walk.algos.off_policy import Batch
 from mjx_walk.algos.sac import SAC, SACConfig, SACState
 from mjx_walk.common import networks
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 
 
 @dataclasses.dataclass

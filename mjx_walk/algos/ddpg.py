@@ -4,7 +4,7 @@ import dataclasses
 from typing import ClassVar
 
 from mjx_walk.algos.deterministic import DeterministicAlgorithm, DeterministicConfig
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 
 
 @dataclasses.dataclass

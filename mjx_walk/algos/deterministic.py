@@ -14,7 +14,7 @@ from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
 from mjx_walk.common import networks
 from mjx_walk.common.optimizers import polyak_update
-from mjx_walk.utils.settings import AnyBut, setting
+from mjx_walk.utils.setting_fields import AnyBut, setting
 
 
 @dataclasses.dataclass

@@ -3,7 +3,7 @@
 import dataclasses
 
 from mjx_walk.common import networks
-from mjx_walk.utils.settings import AnyBut, setting
+from mjx_walk.utils.setting_fields import AnyBut, setting
 
 
 @dataclasses.dataclass

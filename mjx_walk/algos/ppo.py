@@ -18,7 +18,7 @@ from mjx_walk.algos.on_policy import (
 from mjx_walk.common.brax_losses import make_ppo_loss
 from mjx_walk.common.optimizers import schedule_factor
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 from mjx_walk.utils.types import Metrics, as_means
 
 

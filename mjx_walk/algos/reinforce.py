@@ -11,7 +11,7 @@ from mjx_walk.algos.on_policy import OnPolicyBatch, OnPolicyState
 from mjx_walk.algos.policy_gradient import PolicyGradientAlgorithm, PolicyGradientConfig, Samples, normalize
 from mjx_walk.common import returns
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 from mjx_walk.utils.types import Metrics, as_means
 
 

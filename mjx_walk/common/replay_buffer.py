@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mjx_walk.common.returns import n_step_return
 from mjx_walk.envs import Task
-from mjx_walk.utils.devices import num_bytes
+from mjx_walk.machine.devices import num_bytes
 from mjx_walk.utils.types import Transition
 
 _GOES_ON, _TERMINATED, _FIRST_CUT = 0, 1, 2

@@ -15,11 +15,11 @@ from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
 from mjx_walk.envs.models import warn_of_changed_sources
 from mjx_walk.evaluation.gymnasium_worker import send
-from mjx_walk.runs.progress import ScoringProgress
-from mjx_walk.runs.scores import Scores
-from mjx_walk.utils.settings import MAX_SEED, setting
-from mjx_walk.utils.signals import undisturbed
-from mjx_walk.utils.subprocesses import start_module
+from mjx_walk.logs.progress import ScoringProgress
+from mjx_walk.machine.signals import undisturbed
+from mjx_walk.machine.subprocesses import start_module
+from mjx_walk.storage.scores import Scores
+from mjx_walk.utils.setting_fields import MAX_SEED, setting
 from mjx_walk.utils.types import PolicyFn
 
 _MAX_PARALLEL_EPISODES = 1024

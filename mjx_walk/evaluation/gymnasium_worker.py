@@ -13,7 +13,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from mjx_walk.utils.streams import open_standard_streams
+from mjx_walk.machine.streams import open_standard_streams
 
 _STDOUT, _STDERR = 1, 2
 
@@ -31,7 +31,7 @@ def serve() -> None:
     warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
     import gymnasium
 
-    from mjx_walk.utils.quiet_mujoco import hide_deprecations, write_no_log
+    from mjx_walk.machine.quiet_mujoco import hide_deprecations, write_no_log
 
     write_no_log()
     gymnasium.logger.min_level = gymnasium.logger.ERROR

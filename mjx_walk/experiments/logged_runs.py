@@ -10,11 +10,11 @@ import numpy as np
 import scipy.stats
 
 from mjx_walk.envs import TASKS
-from mjx_walk.runs.config import Config, flatten
-from mjx_walk.runs.metrics import Row, read_rows
-from mjx_walk.runs.run_folder import RunFolder, open_existing
-from mjx_walk.runs.saved_config import read_saved_config
-from mjx_walk.runs.scores import BEST, BETTER, ScoreFile, read_scores
+from mjx_walk.logs.metrics import Row, read_rows
+from mjx_walk.settings.config import Config, flatten
+from mjx_walk.settings.saved_config import read_saved_config
+from mjx_walk.storage.run_folder import RunFolder, open_existing
+from mjx_walk.storage.scores import BEST, BETTER, ScoreFile, read_scores
 from mjx_walk.utils.errors import UserError
 
 MIN_SEEDS_FOR_INTERVALS = 3

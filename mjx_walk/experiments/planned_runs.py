@@ -16,20 +16,20 @@ from pathlib import Path
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from mjx_walk.envs.physics import resolve_engine
-from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import Config, load_config
-from mjx_walk.runs.inputs import changed_input
-from mjx_walk.runs.metrics import read_rows
-from mjx_walk.runs.overrides import complete_overrides, sweep_choices
-from mjx_walk.runs.preparation import locked_folder
-from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.saved_config import differences, in_short, read_saved_config
-from mjx_walk.utils.devices import only_device
+from mjx_walk.logs.metrics import read_rows
+from mjx_walk.machine.devices import only_device
+from mjx_walk.machine.signals import Interrupt
+from mjx_walk.machine.subprocesses import start_module
+from mjx_walk.settings.config import Config, load_config
+from mjx_walk.settings.input_files import changed_input
+from mjx_walk.settings.overrides import complete_overrides, sweep_choices
+from mjx_walk.settings.saved_config import differences, in_short, read_saved_config
+from mjx_walk.storage import checkpoint
+from mjx_walk.storage.files import check_replaceable, open_to_append, refuse_links, user_path
+from mjx_walk.storage.locks import locked
+from mjx_walk.storage.run_folder import RunFolder
+from mjx_walk.training.folder_checks import locked_folder
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import check_replaceable, open_to_append, refuse_links, user_path
-from mjx_walk.utils.locks import locked
-from mjx_walk.utils.signals import Interrupt
-from mjx_walk.utils.subprocesses import start_module
 from mjx_walk.utils.text import format_score
 
 _SECONDS_BETWEEN_REPORTS = 30.0

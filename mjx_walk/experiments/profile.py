@@ -19,9 +19,9 @@ from mjx_walk.envs import Task
 from mjx_walk.envs.physics import make_engine
 from mjx_walk.experiments.program_costs import learning_flops
 from mjx_walk.experiments.timing import Measurement
-from mjx_walk.runs.config import Config
+from mjx_walk.machine.devices import default_device
+from mjx_walk.settings.config import Config
 from mjx_walk.training.programs import make_init, make_step
-from mjx_walk.utils.devices import default_device
 from mjx_walk.utils.types import Metrics, as_means
 from mjx_walk.viewing.episode import make_gymnasium
 

@@ -9,9 +9,9 @@ import scipy.stats
 from matplotlib.axes import Axes
 
 from mjx_walk.experiments.logged_runs import MIN_SEEDS_FOR_IQM, LoggedRun, interval, mean_curve
-from mjx_walk.runs.metrics import write_csv
-from mjx_walk.runs.scores import BEST, FINAL
-from mjx_walk.utils.files import replacing, write_text
+from mjx_walk.logs.metrics import write_csv
+from mjx_walk.storage.files import replacing, write_text
+from mjx_walk.storage.scores import BEST, FINAL
 from mjx_walk.utils.text import format_score, in_markdown
 from mjx_walk.viewing.run_plots import evaluations, learning_axes, series
 

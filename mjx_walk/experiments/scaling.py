@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 from mjx_walk.algos import make_algorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
+from mjx_walk.evaluation.saved_policies import make_task
 from mjx_walk.experiments.program_costs import reduced_bytes
 from mjx_walk.experiments.recorded_time import read_device_time
 from mjx_walk.experiments.timing import Measurement, training
-from mjx_walk.runs.config import Config
-from mjx_walk.runs.metrics import Row
-from mjx_walk.runs.policies import make_task
+from mjx_walk.logs.metrics import Row
+from mjx_walk.settings.config import Config
 from mjx_walk.training.call_profile import CALLS_BEFORE
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError

@@ -13,10 +13,10 @@ from mjx_walk.experiments import planned_runs
 from mjx_walk.experiments.logged_runs import LoggedRun, group, interval, read_runs
 from mjx_walk.experiments.planned_runs import PlannedRun
 from mjx_walk.experiments.report import DRAWN, LEGEND, csv_row, draw_curves, run_cells, table, write_comparison
-from mjx_walk.runs.metrics import write_csv
-from mjx_walk.runs.scores import BEST, FINAL
+from mjx_walk.logs.metrics import write_csv
+from mjx_walk.storage.files import refuse_links, replacing, user_path, write_text
+from mjx_walk.storage.scores import BEST, FINAL
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import refuse_links, replacing, user_path, write_text
 from mjx_walk.utils.text import format_score
 from mjx_walk.viewing.figures import standard_style
 from mjx_walk.viewing.run_plots import THOUSANDS

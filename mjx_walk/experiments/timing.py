@@ -9,10 +9,10 @@ from pathlib import Path
 from subprocess import STDOUT, Popen, TimeoutExpired
 from typing import NamedTuple
 
-from mjx_walk.runs.metrics import Row, read_rows
+from mjx_walk.logs.metrics import Row, read_rows
+from mjx_walk.machine.signals import as_by_ctrl_c
+from mjx_walk.machine.subprocesses import start_module, with_parent
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.signals import as_by_ctrl_c
-from mjx_walk.utils.subprocesses import start_module, with_parent
 
 _PATIENCE = 60.0
 """Seconds: a training hangs if it logs no row for at least this long, and is killed if it takes longer to end."""

@@ -16,7 +16,7 @@ from mujoco import mjx
 from mjx_walk.envs import NO_TIME_LIMIT, make_env
 from mjx_walk.envs.physics.mjx_model import with_newton_solver
 from mjx_walk.envs.state import check_action_shape
-from mjx_walk.utils.compat import standard_dtypes
+from mjx_walk.machine.compat import standard_dtypes
 from mjx_walk.utils.errors import UserError
 
 _MODEL_ARRAYS = {field.name for field in dataclasses.fields(mjx.Model)}

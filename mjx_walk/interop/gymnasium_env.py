@@ -15,7 +15,7 @@ from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.state import check_action_shape
 from mjx_walk.interop.gymnasium_info import single_info
 from mjx_walk.interop.gymnasium_programs import is_forked, make_programs, refuse_fork
-from mjx_walk.interop.gymnasium_twin import (
+from mjx_walk.interop.mujoco_attributes import (
     RENDER_MODES,
     MujocoAttributes,
     make_twin,

@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from mjx_walk.envs import TASKS, State, Task, TaskOptions
 from mjx_walk.envs.info import Info
 from mjx_walk.envs.physics import resolve_engine
-from mjx_walk.utils.compat import prepare_jax
+from mjx_walk.machine.compat import prepare_jax
 
 _process_of_jax: list[int] = []
 """Id of the process in which this module first used JAX."""

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from mjx_walk.envs import State
-from mjx_walk.interop.gymnasium_twin import MujocoAttributes
+from mjx_walk.interop.mujoco_attributes import MujocoAttributes
 
 if TYPE_CHECKING:
     from mjx_walk.interop.gymnasium_vector_env import MjxWalkVectorEnv

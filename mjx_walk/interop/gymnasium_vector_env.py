@@ -16,7 +16,7 @@ from mjx_walk.envs.state import check_action_shape
 from mjx_walk.interop.gymnasium_info import add_flags, add_info
 from mjx_walk.interop.gymnasium_programs import make_programs, refuse_fork
 from mjx_walk.interop.gymnasium_sub_env import SubEnv
-from mjx_walk.interop.gymnasium_twin import RENDER_MODES, make_twin, split_keywords
+from mjx_walk.interop.mujoco_attributes import RENDER_MODES, make_twin, split_keywords
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.value_types import type_problem
 

@@ -2,9 +2,9 @@
 
 import logging
 
-from mjx_walk.runs.config import Config
-from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.utils.devices import default_device
+from mjx_walk.machine.devices import default_device
+from mjx_walk.settings.config import Config
+from mjx_walk.storage.run_folder import RunFolder
 
 __all__ = ["announce"]
 

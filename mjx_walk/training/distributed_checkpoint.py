@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_walk.algos import TrainState
-from mjx_walk.runs import checkpoint
+from mjx_walk.storage import checkpoint
 from mjx_walk.training.distributed import Processes
 from mjx_walk.utils.types import map_marked
 

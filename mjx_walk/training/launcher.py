@@ -9,10 +9,10 @@ import tempfile
 import time
 from pathlib import Path
 
-from mjx_walk.utils.devices import count_devices, only_device
+from mjx_walk.machine.devices import count_devices, only_device
+from mjx_walk.machine.signals import Interrupt, exit_code
+from mjx_walk.machine.subprocesses import python
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.signals import Interrupt, exit_code
-from mjx_walk.utils.subprocesses import python
 
 _log = logging.getLogger(__name__)
 

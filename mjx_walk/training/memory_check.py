@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 
 from mjx_walk.algos import Algorithm
-from mjx_walk.utils.devices import device_memory, num_bytes
+from mjx_walk.machine.devices import device_memory, num_bytes
 from mjx_walk.utils.errors import UserError
 
 _USABLE = 0.9

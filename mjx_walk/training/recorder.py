@@ -9,16 +9,16 @@ from typing import Any
 from mjx_walk.algos import Algorithm, TrainState
 from mjx_walk.envs import Task
 from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium
-from mjx_walk.runs import checkpoint
-from mjx_walk.runs.background_saver import BackgroundSaver, Part
-from mjx_walk.runs.config import Config
-from mjx_walk.runs.inputs import read_inputs, save_inputs
-from mjx_walk.runs.loggers import MetricsWriter, WandbLog
-from mjx_walk.runs.metrics import Row
-from mjx_walk.runs.policies import best_policy, deterministic_act, make_acting_algorithm
-from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.saved_config import as_yaml, save_config
-from mjx_walk.runs.scores import BEST, FINAL, Scores, write_scores
+from mjx_walk.evaluation.saved_policies import best_policy, deterministic_act, make_acting_algorithm
+from mjx_walk.logs.loggers import MetricsWriter, WandbLog
+from mjx_walk.logs.metrics import Row
+from mjx_walk.settings.config import Config
+from mjx_walk.settings.input_files import read_inputs, save_inputs
+from mjx_walk.settings.saved_config import as_yaml, save_config
+from mjx_walk.storage import checkpoint
+from mjx_walk.storage.background_saver import BackgroundSaver, Part
+from mjx_walk.storage.run_folder import RunFolder
+from mjx_walk.storage.scores import BEST, FINAL, Scores, write_scores
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.distributed_checkpoint import NUM_DEVICES, SEEDS_TOGETHER, device_folder, restore_newest
 from mjx_walk.utils.errors import UserError

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from mjx_walk.algos import TrainState
-from mjx_walk.runs.checkpoint import list_steps, read_meta
-from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.storage.checkpoint import list_steps, read_meta
+from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.training.distributed_checkpoint import SEEDS_TOGETHER
 from mjx_walk.training.recorder import Recorder
 from mjx_walk.utils.errors import UnreadableError, UserError

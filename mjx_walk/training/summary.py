@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
-from mjx_walk.runs.scores import BEST, FINAL, Scores
+from mjx_walk.storage.scores import BEST, FINAL, Scores
 from mjx_walk.utils.text import duration
 
 __all__ = ["choice_line", "end_lines", "score_lines"]

@@ -17,10 +17,11 @@ from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
 from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.envs.vector_env import check_resets
-from mjx_walk.runs.config import Config
-from mjx_walk.runs.metrics import Row, mean_row, name_metrics, physics_warnings
-from mjx_walk.runs.progress import Progress
-from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.logs.metrics import Row, mean_row, name_metrics, physics_warnings
+from mjx_walk.logs.progress import Progress
+from mjx_walk.machine.signals import Interrupt, postponed, undisturbed
+from mjx_walk.settings.config import Config
+from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.training.call_profile import CallProfile
 from mjx_walk.training.distributed import Processes, make_devices_program, per_device
 from mjx_walk.training.programs import (
@@ -35,7 +36,6 @@ from mjx_walk.training.speed import Speed
 from mjx_walk.training.summary import end_lines, score_lines
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.signals import Interrupt, postponed, undisturbed
 from mjx_walk.utils.types import Metrics
 
 _log = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""Tools and types that every other package may use: settings, errors, signals, devices, processes, JAX's releases.
+"""Small tools and types that every other package may use: errors, text, checked fields of settings, collectives.
 
-Code that depends on tasks, algorithms, runs or training belongs in another package.
+Code that depends on tasks, runs or the machine belongs in another package.
 """

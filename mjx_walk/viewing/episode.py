@@ -13,7 +13,7 @@ import numpy as np
 from mjx_walk.envs import Task, View
 from mjx_walk.envs.models import warn_of_changed_sources
 from mjx_walk.envs.motors import torques_per_force
-from mjx_walk.utils.quiet_mujoco import hide_deprecations
+from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.viewing.rendering import choose_opengl
 from mjx_walk.viewing.task_env import TaskEnv
 

@@ -12,14 +12,14 @@ import imageio.v3 as iio
 import jax
 import numpy as np
 
-from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import Config
-from mjx_walk.runs.policies import SavedPolicy
-from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.saved_config import save_config
-from mjx_walk.runs.scores import FINAL
-from mjx_walk.runs.tensorboard import EventFile, Summary
-from mjx_walk.utils.subprocesses import start_module
+from mjx_walk.evaluation.saved_policies import SavedPolicy
+from mjx_walk.logs.tensorboard import EventFile, Summary
+from mjx_walk.machine.subprocesses import start_module
+from mjx_walk.settings.config import Config
+from mjx_walk.settings.saved_config import save_config
+from mjx_walk.storage import checkpoint
+from mjx_walk.storage.run_folder import RunFolder
+from mjx_walk.storage.scores import FINAL
 from mjx_walk.viewing.episode import record_episode
 from mjx_walk.viewing.rendering import write_film
 

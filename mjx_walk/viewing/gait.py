@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.gridspec import SubplotSpec
 
 from mjx_walk.envs.motors import joint_of
-from mjx_walk.utils.files import replacing
+from mjx_walk.storage.files import replacing
 from mjx_walk.utils.text import format_score
 from mjx_walk.viewing.episode import Episode
 from mjx_walk.viewing.figures import standard_style

@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 
 from mjx_walk.envs import View
+from mjx_walk.storage.files import write_text
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import write_text
 from mjx_walk.utils.text import format_score
 from mjx_walk.viewing.episode import Episode
 

@@ -11,10 +11,10 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
+from mjx_walk.machine.opengl import has_screen
+from mjx_walk.machine.subprocesses import python
+from mjx_walk.storage.files import replacing
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import replacing
-from mjx_walk.utils.opengl import has_screen
-from mjx_walk.utils.subprocesses import python
 
 _RENDERERS = ("egl", "osmesa", "glfw")
 """Values of `MUJOCO_GL` that Gymnasium renders with; the last one needs a screen."""

@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from mjx_walk.envs import TASKS
-from mjx_walk.runs.metrics import Row, read_rows, write_csv
-from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.saved_config import read_saved_config
+from mjx_walk.logs.metrics import Row, read_rows, write_csv
+from mjx_walk.settings.saved_config import read_saved_config
+from mjx_walk.storage.files import replacing
+from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import replacing
 from mjx_walk.viewing.figures import standard_style
 
 _X_AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))

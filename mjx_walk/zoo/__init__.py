@@ -7,10 +7,10 @@ that trains or scores policies does not belong here. `python -m mjx_walk.zoo` li
 import shutil
 from pathlib import Path
 
-from mjx_walk.runs.run_folder import RunFolder, open_existing
-from mjx_walk.runs.scores import BEST, read_scores
+from mjx_walk.storage.files import user_path
+from mjx_walk.storage.run_folder import RunFolder, open_existing
+from mjx_walk.storage.scores import BEST, read_scores
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.files import user_path
 from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.text import format_score
 

@@ -8,13 +8,13 @@ import jax
 
 from mjx_walk import zoo
 from mjx_walk.api import load_run
-from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import training_command
-from mjx_walk.runs.saved_config import save_config
-from mjx_walk.runs.scores import BEST, write_scores
-from mjx_walk.utils import cli
+from mjx_walk.cli import parsing
+from mjx_walk.settings.config import training_command
+from mjx_walk.settings.saved_config import save_config
+from mjx_walk.storage import checkpoint
+from mjx_walk.storage.scores import BEST, write_scores
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.settings import setting
+from mjx_walk.utils.setting_fields import setting
 
 USAGE = """
 usage: python -m mjx_walk.zoo
@@ -40,7 +40,7 @@ class Arguments:
 
 def main(command_line: list[str]) -> None:
     """List the policies, or add one."""
-    arguments = cli.parse(Arguments, command_line, USAGE)
+    arguments = parsing.parse(Arguments, command_line, USAGE)
     if arguments.add is None:
         if arguments.name is not None:
             raise UserError(f"name={arguments.name} needs add=RUN_DIR, the run to add under this name")
@@ -77,4 +77,4 @@ def _rounded_to(dtype: str, policy_params: Any) -> Any:
 
 
 if __name__ == "__main__":
-    cli.main(main)
+    parsing.main(main)

@@ -18,7 +18,7 @@ from toy_tasks import EndlessReward
 
 from mjx_walk.algos import ALGORITHMS, make_algorithm
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
-from mjx_walk.utils.settings import has_effect
+from mjx_walk.utils.setting_fields import has_effect
 
 CHANGES = {
     "distribution": {"tanh_normal": "normal", "normal": "tanh_normal"},

@@ -13,7 +13,7 @@ from mjx_walk.algos.ppo import PPOConfig
 from mjx_walk.algos.sac import SACConfig
 from mjx_walk.common import networks
 from mjx_walk.envs import make_env
-from mjx_walk.runs.config import load_config
+from mjx_walk.settings.config import load_config
 
 KEY = jax.random.PRNGKey(0)
 

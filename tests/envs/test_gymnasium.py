@@ -15,7 +15,7 @@ from helpers import OPTIMIZED
 from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.models import model_path
 from mjx_walk.envs.physics import PhysicsState
-from mjx_walk.utils.quiet_mujoco import hide_deprecations
+from mjx_walk.machine.quiet_mujoco import hide_deprecations
 
 VERSIONS = [(name, version) for name in TASKS for version in TASKS[name][0].XML_FILES]
 COMPUTED = ("sin", "cos", "to_target")

@@ -14,7 +14,7 @@ from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.model_files import source_hashes
 from mjx_walk.envs.models import load_model
 from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium
-from mjx_walk.runs.config import load_config
+from mjx_walk.settings.config import load_config
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.episode import make_gymnasium
 

@@ -13,8 +13,8 @@ from helpers import CLONE, TINY, train_here
 
 from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.models import load_model
+from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.quiet_mujoco import hide_deprecations
 
 FOLDERS = {
     "Gymnasium": ("gymnasium", "envs/mujoco/assets"),

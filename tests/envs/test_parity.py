@@ -1,4 +1,4 @@
-"""The MJX engines against MuJoCo's C library, one step at a time; the tolerances are `mjx_walk.evaluation.parity`'s."""
+"""The MJX engines against MuJoCo's C library, one step at a time, with the tolerances of `evaluation.engine_parity`."""
 
 import ctypes
 
@@ -14,7 +14,7 @@ from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.physics import PhysicsState, make_engine, mjx_warp
 from mjx_walk.evaluation import parity
 from mjx_walk.evaluation.random_steps import take_random_steps
-from mjx_walk.utils.compat import prepare_jax
+from mjx_walk.machine.compat import prepare_jax
 from mjx_walk.utils.errors import UserError
 
 prepare_jax()  # before any test of this process starts JAX

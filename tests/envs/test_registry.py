@@ -14,7 +14,7 @@ from mjx_walk.algos.base import Algorithm
 from mjx_walk.envs import TASKS, Task, TaskOptions, make_env, registry
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
-from mjx_walk.runs.recipes import base_recipe
+from mjx_walk.settings.recipes import base_recipe
 from mjx_walk.utils.errors import UserError
 
 

@@ -17,8 +17,8 @@ from toy_tasks import MountainCar
 
 from mjx_walk.envs import TASKS, TrainableTask, make_env
 from mjx_walk.envs.physics import base
+from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.quiet_mujoco import hide_deprecations
 from mjx_walk.viewing.episode import make_gymnasium
 
 

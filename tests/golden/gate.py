@@ -180,7 +180,7 @@ def read_arrays(folder: Path) -> dict[str, np.ndarray]:
 def _renamed(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Leaves of the reference under their present names."""
     sys.path.insert(0, str(TREE))
-    from mjx_walk.runs.checkpoint import present_name
+    from mjx_walk.storage.checkpoint import present_name
 
     return {present_name(name): array for name, array in arrays.items()}
 

@@ -11,7 +11,7 @@ from gpu_gate import checked_rows, require, run, run_python
 
 from mjx_walk import zoo
 from mjx_walk.envs import TASKS
-from mjx_walk.runs.scores import read_scores
+from mjx_walk.storage.scores import read_scores
 
 pytestmark = pytest.mark.gpu
 

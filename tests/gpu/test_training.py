@@ -9,8 +9,8 @@ import pytest
 from gpu_gate import checked_rows, finish, run, start
 from helpers import wait_for_line
 
-from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import load_config
+from mjx_walk.settings.config import load_config
+from mjx_walk.storage import checkpoint
 
 pytestmark = pytest.mark.gpu
 

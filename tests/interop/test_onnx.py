@@ -15,9 +15,9 @@ import mjx_walk
 from mjx_walk import zoo
 from mjx_walk.algos import make_algorithm
 from mjx_walk.api import make_task
+from mjx_walk.evaluation.saved_policies import deterministic_act
 from mjx_walk.interop.onnx import translate
-from mjx_walk.runs.config import load_config
-from mjx_walk.runs.policies import deterministic_act
+from mjx_walk.settings.config import load_config
 from mjx_walk.utils.errors import UserError
 
 

@@ -4,8 +4,8 @@ import logging
 
 import pytest
 
-from mjx_walk.runs.config import load_config
-from mjx_walk.runs.run_folder import RunFolder
+from mjx_walk.settings.config import load_config
+from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.training.announcement import announce
 
 

@@ -16,10 +16,10 @@ from mjx_walk.algos.off_policy_config import OffPolicyConfig
 from mjx_walk.algos.ppo import PPO, PPOConfig
 from mjx_walk.common import networks, returns
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
-from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import load_config
-from mjx_walk.runs.metrics import read_rows
-from mjx_walk.runs.policies import make_task
+from mjx_walk.evaluation.saved_policies import make_task
+from mjx_walk.logs.metrics import read_rows
+from mjx_walk.settings.config import load_config
+from mjx_walk.storage import checkpoint
 from mjx_walk.training.distributed import Processes, _init_on_device, in_place, per_device
 from mjx_walk.training.distributed_checkpoint import restore_newest
 from mjx_walk.training.programs import make_init

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from mjx_walk.algos import make_algorithm
-from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import load_config
-from mjx_walk.runs.policies import SavedPolicy, choose_policy, load_policy, make_task
-from mjx_walk.runs.run_folder import RunFolder, open_existing
-from mjx_walk.runs.scores import Scores, read_scores
+from mjx_walk.evaluation.saved_policies import SavedPolicy, choose_policy, load_policy, make_task
+from mjx_walk.settings.config import load_config
+from mjx_walk.storage import checkpoint
+from mjx_walk.storage.run_folder import RunFolder, open_existing
+from mjx_walk.storage.scores import Scores, read_scores
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.recorder import Recorder
 from mjx_walk.utils.errors import UserError
@@ -195,7 +195,7 @@ def test_a_full_disk_costs_one_line_and_no_checkpoint(run, monkeypatch):
     recorder.save(state, env_steps=4, wall_seconds=1.0)
     recorder.wait()
     usage = shutil.disk_usage(folder.path)
-    monkeypatch.setattr("mjx_walk.runs.arrays.shutil.disk_usage", lambda path: usage._replace(free=10))
+    monkeypatch.setattr("mjx_walk.storage.arrays.shutil.disk_usage", lambda path: usage._replace(free=10))
     recorder.save(state, env_steps=8, wall_seconds=2.0)
     says = rf"cannot write .*: No space left on device; .* continue with run_dir={folder.path} resume=true"
     with pytest.raises(UserError, match=says):

@@ -28,9 +28,9 @@ from helpers import (
 from shared_programs import shared_programs
 
 from mjx_walk.api import resolve
-from mjx_walk.runs import checkpoint
+from mjx_walk.machine.subprocesses import start_module
+from mjx_walk.storage import checkpoint
 from mjx_walk.training import trainer
-from mjx_walk.utils.subprocesses import start_module
 
 TASK = {"c": "env=walker2d", "jax": "env=inverted_pendulum", "warp": "env=walker2d"}
 """Without contacts, the `jax` engine compiles in a fraction of the time."""

@@ -8,10 +8,10 @@ import pytest
 from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command_here, leaves, train, train_here
 
 from mjx_walk import train as train_command
-from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import load_config
-from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.saved_config import save_config
+from mjx_walk.settings.config import load_config
+from mjx_walk.settings.saved_config import save_config
+from mjx_walk.storage import checkpoint
+from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.training import seeds_together
 from mjx_walk.training.seeds_together import have_saved, restore_together
 from mjx_walk.utils.errors import UnreadableError, UserError

@@ -14,11 +14,11 @@ from shared_programs import shared_programs
 import mjx_walk
 from mjx_walk import train as train_command
 from mjx_walk.algos import make_algorithm
-from mjx_walk.runs import checkpoint
-from mjx_walk.runs.config import load_config
-from mjx_walk.runs.policies import make_task
-from mjx_walk.runs.preparation import prepared
+from mjx_walk.evaluation.saved_policies import make_task
+from mjx_walk.settings.config import load_config
+from mjx_walk.storage import checkpoint
 from mjx_walk.training import programs
+from mjx_walk.training.folder_checks import prepared
 from mjx_walk.training.programs import make_init, make_step
 from mjx_walk.utils.errors import UserError
 

@@ -6,9 +6,9 @@ import matplotlib.figure
 import numpy as np
 import pytest
 
-from mjx_walk.runs.config import load_config
-from mjx_walk.runs.run_folder import RunFolder
-from mjx_walk.runs.saved_config import save_config
+from mjx_walk.settings.config import load_config
+from mjx_walk.settings.saved_config import save_config
+from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.viewing.run_plots import evaluations, plot_run
 
 

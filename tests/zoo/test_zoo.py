@@ -9,10 +9,10 @@ from helpers import command, command_here, slow_except
 
 import mjx_walk
 from mjx_walk import zoo
-from mjx_walk.runs.config import flatten, load_config, training_command
-from mjx_walk.runs.saved_config import read_config
-from mjx_walk.runs.scores import read_scores
-from mjx_walk.utils.settings import has_effect
+from mjx_walk.settings.config import flatten, load_config, training_command
+from mjx_walk.settings.saved_config import read_config
+from mjx_walk.storage.scores import read_scores
+from mjx_walk.utils.setting_fields import has_effect
 
 NAMES = zoo.names()
 FAST = ("humanoid-csac", "humanoid_standup-td3", "walker2d-ppo", "pusher-csac")

@@ -1,0 +1,236 @@
+"""The final and the best policy of a run, saved separately from its checkpoints and small enough to ship."""
+
+import dataclasses
+import functools
+import logging
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_walk.algos import Algorithm, TrainState, make_algorithm, without_replay
+from mjx_walk.envs import TASKS, Task
+from mjx_walk.envs.inline_evaluation import NO_RETURN
+from mjx_walk.envs.physics import resolve_engine
+from mjx_walk.machine.compat import standard_settings
+from mjx_walk.settings.config import Config
+from mjx_walk.settings.input_files import check_model, warn_of_changed_inputs
+from mjx_walk.settings.saved_config import read_saved_config
+from mjx_walk.storage import checkpoint
+from mjx_walk.storage.run_folder import RunFolder
+from mjx_walk.storage.scores import BEST, FINAL, POLICIES
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.types import PolicyFn
+
+__all__ = [
+    "SavedPolicy",
+    "best_policy",
+    "default_policy",
+    "deterministic_act",
+    "deterministic_policy",
+    "kept_policies",
+    "make_acting_algorithm",
+    "make_task",
+]
+
+_LOGGER = logging.getLogger(__name__)
+
+
+class SavedPolicy:
+    """A policy of a run folder, and the task that it was trained on."""
+
+    @standard_settings()
+    def __init__(self, folder: RunFolder, physics: str | None = None, policy: str = BEST):
+        """
+        Args:
+            folder: folder of a run that has saved a policy.
+            physics: engine to use instead of the run's own.
+            policy: `final`, the one of the newest checkpoint, or `best`, the one with the highest evaluation during
+                training or at its end. Before the first evaluation ends, there is only `final`, and `best` gives it.
+
+        Raises:
+            UserError: no usable policy.
+        """
+        self.path = folder.path.absolute()
+        """The folder, whatever becomes of the working directory."""
+        saved = read_saved_config(folder)
+        self.reward_function = saved.env.reward_function
+        """`PATH.py:FUNCTION` of the training, which is not loaded."""
+        self.config = _without_reward_function(saved)
+        self._physics = physics
+        check_model(folder, self.config.env)
+        self._build()
+        warn_of_changed_inputs(folder, saved.env)
+        self.policy_name = choose_policy(folder, policy)
+        """`final` or `best`."""
+        self.policy_params, self.policy_facts = _load(folder, self.policy_name, self.algorithm)
+
+    def _build(self) -> None:
+        engine = self._physics or _engine_here(self.config.physics)
+        self.task = make_task(dataclasses.replace(self.config, physics=engine))
+        self.algorithm = make_acting_algorithm(self.task, self.config)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle and copy the parameters, without compiled functions."""
+        kept = {name: value for name, value in vars(self).items() if name not in ("task", "algorithm", "act")}
+        return kept | {"policy_params": jax.device_get(self.policy_params)}
+
+    @standard_settings()
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._build()
+
+    @functools.cached_property
+    def act(self) -> Callable:
+        """The deterministic policy as a compiled JAX function of f32 observations."""
+        return deterministic_act(self.algorithm, self.policy_params)
+
+    def policy(self, obs: np.ndarray) -> np.ndarray:
+        """The deterministic action for one observation or a batch, in Gymnasium's units.
+
+        Args:
+            obs: `[…, observation_size]`, any float dtype.
+
+        Raises:
+            UserError: the observation has another size, or is no array.
+        """
+        size = self.task.observation_size
+        try:
+            obs = np.asarray(obs, np.float32)
+        except (TypeError, ValueError) as error:
+            also = "; env.reset() returns the observation and info" if isinstance(obs, tuple) else ""
+            raise UserError(f"the observation is no array of numbers; this policy takes […, {size}]{also}") from error
+        if obs.shape[-1:] != (size,):
+            raise UserError(f"the observation has the shape {obs.shape}; this policy takes […, {size}]")
+        return np.asarray(self.act(obs))
+
+
+def make_task(config: Config) -> Task:
+    """Build the unbatched environment of a configuration."""
+    return TASKS[config.env.name][0](config.env, config.physics)
+
+
+def make_acting_algorithm(task: Task, config: Config) -> Algorithm:
+    """The algorithm of a configuration, in float32: a policy then acts alike on every machine."""
+    algo = dataclasses.replace(config.algo, network_dtype="float32")
+    return make_algorithm(task, config.num_envs, config.evaluation, algo)
+
+
+def deterministic_act(algorithm: Algorithm, policy_params: Any) -> Callable[[Any], Any]:
+    """Compile the deterministic policy, `obs […, observation_size] → action […, action_size]`, in Gymnasium's units."""
+
+    @jax.jit
+    @standard_settings()
+    def act(obs: jax.Array) -> jax.Array:
+        policy = deterministic_policy(algorithm, policy_params)
+        return policy(jnp.asarray(obs, jnp.float32), jax.random.PRNGKey(0))
+
+    return act
+
+
+def deterministic_policy(algorithm: Algorithm, policy_params: Any) -> PolicyFn:
+    """The deterministic policy, `(obs, key) → action`.
+
+    It multiplies matrices in float32. A GPU's default precision would change actions by up to 4e-3.
+    """
+    return functools.partial(_in_float32, algorithm.policy(policy_params, deterministic=True))
+
+
+def _in_float32(policy: PolicyFn, obs: jax.Array, key: jax.Array) -> jax.Array:
+    with jax.default_matmul_precision("float32"):
+        return policy(obs, key)
+
+
+def choose_policy(folder: RunFolder, name: str) -> str:
+    """The name itself if the run has kept that policy; `final` in place of `best` if no evaluation has ended yet.
+
+    Raises:
+        UserError: an unknown name, or the run has not kept that policy.
+    """
+    if name not in POLICIES:
+        raise UserError(f"policy={name}: choose one of: {', '.join(POLICIES)}")
+    kept = kept_policies(folder)
+    if name in kept:
+        return name
+    if name == FINAL and kept and not checkpoint.list_steps(folder.checkpoints):
+        raise UserError(f"{folder.path} has kept only its best policy; choose policy=best")
+    if FINAL in kept:
+        _LOGGER.info("No evaluation during training has ended yet: this is the final policy.")
+        return FINAL
+    if not checkpoint.list_steps(folder.checkpoints):
+        raise UserError(f"{folder.path} holds no policy yet; train it first")
+    return name
+
+
+def default_policy(folder: RunFolder) -> str:
+    """`final`, or `best` for a folder that has kept only that one, as those of the zoo."""
+    return BEST if kept_policies(folder) == [BEST] else FINAL
+
+
+def kept_policies(folder: RunFolder) -> list[str]:
+    """Names of the policies that a run has kept, `final` first."""
+    return [name for name in POLICIES if checkpoint.find(folder.policy(name))]
+
+
+def _load(folder: RunFolder, name: str, algorithm: Algorithm) -> tuple[Any, dict[str, Any]]:
+    """A policy that a run has kept; if it is damaged, the one in the newest checkpoint that is complete."""
+    state = algorithm.state_shapes()
+    try:
+        return load_policy(folder, name, jax.eval_shape(algorithm.policy_params, state))
+    except UserError as error:
+        try:
+            state, facts = checkpoint.restore_newest(folder.checkpoints, without_replay(state))
+        except UserError:
+            raise error from None
+        warnings.warn(f"{error}; the policy of the checkpoint at step {facts['env_steps']:,} is used", stacklevel=2)
+    num_devices = facts.get("num_devices", 1)
+    best = best_policy(state, algorithm.steps_per_iteration * num_devices) if name == BEST else None
+    return best or (algorithm.policy_params(state), {"env_steps": facts["env_steps"]})
+
+
+def load_policy(folder: RunFolder, name: str, like: Any) -> tuple[Any, dict[str, Any]]:
+    """A policy that a run has kept, its `env_steps`, and `eval_return` if an evaluation during training chose it.
+
+    Raises:
+        UserError: the policy is missing or damaged, or it belongs to another environment.
+    """
+    path = checkpoint.find(folder.policy(name))
+    if path is None:
+        raise UserError(f"{folder.policy(name)} is missing")
+    try:
+        params, meta = checkpoint.restore(path, like)
+    except UserError:
+        raise
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    return params, {name: meta[name] for name in ("env_steps", "eval_return") if name in meta}
+
+
+def best_policy(state: TrainState, steps_per_iteration: int) -> tuple[Any, dict[str, Any]] | None:
+    """Policy with the highest inline evaluation, and its facts. None until the first evaluation ends.
+
+    Args:
+        state: a TrainState.
+        steps_per_iteration: environment steps of an iteration, over all devices.
+    """
+    evaluation = state.evaluation
+    if evaluation.best_return <= NO_RETURN:  # -inf in older runs
+        return None
+    env_steps = int(evaluation.best_iteration) * steps_per_iteration
+    return evaluation.best_policy_params, {"env_steps": env_steps, "eval_return": float(evaluation.best_return)}
+
+
+def _engine_here(name: str) -> str:
+    """The engine that a run was trained on, or `auto` if this machine does not support it."""
+    try:
+        return resolve_engine(name)
+    except UserError:
+        return "auto"
+
+
+def _without_reward_function(config: Config) -> Config:
+    """Drop the reward function: a downloaded folder must not run code. The policy and its scores do not need it."""
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, reward_function=None))

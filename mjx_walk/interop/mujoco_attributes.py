@@ -1,0 +1,215 @@
+"""What code for Gymnasium's MuJoCo environments reads of them: the model, times, state and frames.
+
+Each environment holds the real one, its twin. The twin draws resets and renders, and is never stepped.
+"""
+
+import inspect
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer, OffScreenViewer
+from gymnasium.envs.registration import load_env_creator
+
+from mjx_walk.envs import TASKS, State, TaskOptions
+from mjx_walk.machine.opengl import has_screen
+from mjx_walk.machine.quiet_mujoco import hide_deprecations
+from mjx_walk.utils.errors import UserError
+
+RENDER_KEYWORDS = (
+    "render_mode",
+    "width",
+    "height",
+    "camera_id",
+    "camera_name",
+    "default_camera_config",
+    "max_geom",
+    "visual_options",
+)
+"""Gymnasium's keywords that concern frames."""
+
+_SETTABLE = (
+    "metadata",
+    "render_mode",
+    "observation_space",
+    "action_space",
+    "spec",
+    "init_qpos",
+    "init_qvel",
+    "_np_random",
+    "_np_random_seed",
+)
+"""Attributes of Gymnasium's environments that have their meaning here as well when they are set."""
+
+RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple")
+
+
+def split_keywords(keywords: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Keywords of the task, and those of `RENDER_KEYWORDS`."""
+    rendering = {name: value for name, value in keywords.items() if name in RENDER_KEYWORDS}
+    return {name: value for name, value in keywords.items() if name not in rendering}, rendering
+
+
+def make_twin(options: TaskOptions, rendering: dict[str, Any]) -> MujocoEnv:
+    """Gymnasium's own environment, without wrappers.
+
+    Args:
+        options: env options.
+        rendering: values of `RENDER_KEYWORDS`.
+
+    Raises:
+        UserError: `render_mode="human"` without a screen, with which Gymnasium ends the process.
+    """
+    if rendering.get("render_mode") == "human" and not has_screen():
+        raise UserError("render_mode='human' needs a screen; use render_mode='rgb_array'")
+    spec = gymnasium.spec(TASKS[options.name][0].id_of(options))
+    create: Any = load_env_creator(str(spec.entry_point))
+    with hide_deprecations():
+        return create(**spec.kwargs | options.gymnasium_kwargs() | rendering)
+
+
+class MujocoAttributes:
+    """The attributes of Gymnasium's `MujocoEnv`, except for a live `data`.
+
+    The physics reads only the state of `set_state` and, at resets of a single environment, `init_qpos` and `init_qvel`.
+    Other changes are refused.
+    """
+
+    _twin: MujocoEnv
+    render_mode: str | None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute of the environment.
+
+        Raises:
+            UserError: Gymnasium's environment reads the attribute, and this one does not.
+        """
+        twin = getattr(self, "_twin", None)  # None while the environment is built
+        is_read = twin is not None and (name in vars(twin) or hasattr(type(twin), name))
+        if is_read and name not in _SETTABLE and not hasattr(gymnasium.Env, name):
+            instead = {"model": "; use xml_file=PATH instead", "data": "; use set_state instead"}
+            if callable(getattr(type(twin), name, None)):
+                instead[name] = "; write a task of your own instead"
+            keyword = name.removeprefix("_")
+            if keyword in (*inspect.signature(type(twin)).parameters, *RENDER_KEYWORDS):
+                instead[name] = f"; give {keyword}=… to gymnasium.make instead"
+            raise UserError(f"the environment ignores your value of {name}{instead.get(name, '')}")
+        super().__setattr__(name, value)
+
+    def _read_state(self) -> State | None:
+        """State of this environment; None before the first reset."""
+        raise NotImplementedError
+
+    def _write_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        raise NotImplementedError
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """A copy of the MuJoCo model, from which frames are rendered. Changes of its physics are refused."""
+        return self._twin.model
+
+    @property
+    def dt(self) -> float:
+        """Duration of a step, s."""
+        return self._twin.dt
+
+    @property
+    def frame_skip(self) -> int:
+        return self._twin.frame_skip
+
+    @property
+    def init_qpos(self) -> np.ndarray:
+        """`[nq] f64`, m and rad: the pose to which resets add noise."""
+        return self._twin.init_qpos
+
+    @init_qpos.setter
+    def init_qpos(self, value: np.ndarray) -> None:
+        self._twin.init_qpos = value
+
+    @property
+    def init_qvel(self) -> np.ndarray:
+        """`[nv] f64`, m/s and rad/s."""
+        return self._twin.init_qvel
+
+    @init_qvel.setter
+    def init_qvel(self, value: np.ndarray) -> None:
+        self._twin.init_qvel = value
+
+    @property
+    def observation_structure(self) -> dict[str, int]:
+        """Sizes of the observation's parts, of the tasks for which Gymnasium defines them."""
+        return self._twin.observation_structure  # type: ignore[attr-defined]
+
+    @property
+    def width(self) -> int:
+        return self._twin.width
+
+    @property
+    def height(self) -> int:
+        return self._twin.height
+
+    @property
+    def camera_id(self) -> int | None:
+        return self._twin.camera_id
+
+    @property
+    def camera_name(self) -> str | None:
+        return self._twin.camera_name
+
+    def state_vector(self) -> np.ndarray:
+        """Position and velocity, `[nq + nv] f64`."""
+        qpos, qvel = self._position_and_velocity()
+        return np.concatenate([qpos, qvel])
+
+    def set_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Continue from a position, `[nq]` in m and rad, and a velocity, `[nv]` in m/s and rad/s."""
+        assert np.shape(qpos) == (self.model.nq,) and np.shape(qvel) == (self.model.nv,)
+        self._write_state(np.asarray(qpos, np.float32), np.asarray(qvel, np.float32))
+
+    def get_body_com(self, body_name: str) -> np.ndarray:
+        """Position of a body's frame, `[3] f64`, m."""
+        self._show_in_twin()
+        return self._twin.get_body_com(body_name).copy()
+
+    @property
+    def mujoco_renderer(self) -> MujocoRenderer:
+        """Gymnasium's renderer, which shows the present state."""
+        self._show_in_twin()
+        return self._twin.mujoco_renderer
+
+    def render(self) -> Any:
+        """A frame in the environment's `render_mode`, as Gymnasium gives it: `[height, width, 3] u8` for `rgb_array`.
+
+        It shows the positions after the step. Gymnasium's shows those of the last forward pass, a physics step earlier
+        at most.
+        """
+        if self.render_mode in RENDER_MODES and self.render_mode != "human":
+            from mjx_walk.viewing.rendering import choose_opengl
+
+            choose_opengl()
+        renderer = self.mujoco_renderer
+        if renderer.viewer is not None:
+            renderer.viewer.make_context_current()  # Gymnasium leaves the context of another environment current
+        return renderer.render(self.render_mode)
+
+    def _close_twin(self) -> None:
+        """Free the OpenGL objects and close the window.
+
+        Gymnasium leaves the objects to the garbage collector, which deletes those of another context instead.
+        """
+        viewer = self._twin.mujoco_renderer.viewer
+        if isinstance(viewer, OffScreenViewer):
+            viewer.make_context_current()
+            viewer.con.free()
+        self._twin.close()
+
+    def _show_in_twin(self) -> None:
+        self._twin.set_state(*self._position_and_velocity())
+
+    def _position_and_velocity(self) -> tuple[np.ndarray, np.ndarray]:
+        state = self._read_state()
+        if state is None:
+            return self.init_qpos, self.init_qvel
+        return np.array(state.physics.qpos, np.float64), np.array(state.physics.qvel, np.float64)

@@ -1,0 +1,142 @@
+"""The configuration of a run: how a command line becomes one, and back."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from mjx_walk import envs
+from mjx_walk.settings.error_messages import explain
+from mjx_walk.settings.overrides import complete_overrides
+from mjx_walk.settings.own_hydra import own_hydra
+from mjx_walk.settings.recipe_files import with_paths, with_stored_recipes
+from mjx_walk.settings.recipes import CONFIG_DIR, recipe_names
+from mjx_walk.settings.renamed import present_overrides
+from mjx_walk.settings.schema import CheckpointConfig, Config
+from mjx_walk.storage.files import user_path
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.setting_fields import has_effect, refuse_ineffective, validate
+
+__all__ = [
+    "CONFIG_DIR",
+    "CheckpointConfig",
+    "Config",
+    "compose_config",
+    "flatten",
+    "load_config",
+    "recipe_names",
+    "to_config",
+    "training_command",
+    "with_absolute_paths",
+]
+
+
+def load_config(overrides: list[str]) -> Config:
+    """Compose and check a configuration.
+
+    Args:
+        overrides: arguments of the command line, such as `["env=walker2d", "algo.discount=0.99"]`.
+
+    Raises:
+        UserError: invalid overrides, in one line that names the valid choices; or a given setting that has no effect,
+            unless a run is resumed.
+    """
+    overrides = present_overrides(overrides)
+    config = compose_config(overrides)
+    if not config.resume:
+        refuse_ineffective(config, (override.partition("=")[0] for override in overrides))
+    return config
+
+
+def compose_config(overrides: list[str]) -> Config:
+    """Compose a configuration and check its ranges, but not whether the given settings have an effect.
+
+    Args:
+        overrides: as for `load_config`.
+
+    Raises:
+        UserError: invalid overrides.
+    """
+    overrides = complete_overrides(overrides)
+    try:
+        with own_hydra() as store, initialize_config_dir(CONFIG_DIR, version_base="1.3"):
+            config = to_config(compose("train", with_stored_recipes(overrides, store)))
+        return with_absolute_paths(config, Path.cwd())
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(with_paths(explain(error, overrides))) from error
+
+
+def to_config(node: Any) -> Config:
+    """Convert a composed OmegaConf node to checked dataclasses.
+
+    Raises:
+        UserError: a value is out of range.
+    """
+    config = OmegaConf.to_object(node)
+    assert isinstance(config, Config)
+    validate(config)
+    return config
+
+
+def with_absolute_paths(config: Config, folder: Path) -> Config:
+    """A configuration whose files stay the same ones when the run is resumed from another working directory.
+
+    `run_dir` may stay relative, because a resume names it.
+
+    Args:
+        config: as a user gives it.
+        folder: what a relative path is relative to.
+
+    Raises:
+        UserError: a path has `${`, which a saved configuration cannot hold.
+    """
+    run_dir = str(user_path(config.run_dir)) if config.run_dir is not None else None
+    config = dataclasses.replace(config, run_dir=run_dir, env=envs.with_absolute_paths(config.env, folder))
+    for key, value in flatten(config).items():
+        if isinstance(value, str) and "${" in value:
+            raise UserError(f"{key}={value}: '${{' names another setting; choose a name without it")
+    return config
+
+
+def flatten(config: Config) -> dict[str, Any]:
+    """All settings by their full keys, with values as in `config.yaml`."""
+
+    def walk(value: Any, prefix: str):
+        for key, item in value.items():
+            if isinstance(item, dict):
+                yield from walk(item, f"{prefix}{key}.")
+            else:
+                yield prefix + key, item
+
+    return dict(walk(OmegaConf.to_container(OmegaConf.structured(config)), ""))
+
+
+def training_command(config: Config) -> str:
+    """The shortest training command for a configuration: a recipe, and the settings that differ from it."""
+    given = [f"env={config.env.name}", f"algo={config.algo.name}"]
+    usual = f"{config.hardware}/{config.env.name}_{config.algo.name}"
+    recipes = [f"recipe={name}" for name in recipe_names() if Path(name).name == Path(usual).name and name != usual]
+    own = flatten(config)
+    commands = []
+    for asked in (given, *([*given, recipe] for recipe in recipes)):
+        settings = flatten(load_config([f"hardware={config.hardware}", *asked]))
+        relevant = (key for key in sorted(own) if not key.startswith(_IRRELEVANT) and has_effect(config, key))
+        commands.append([*asked, *(f"{key}={own[key]}" for key in relevant if own[key] != settings.get(key))])
+    return " ".join(["python -m mjx_walk.train", *min(commands, key=len)])
+
+
+_IRRELEVANT = (
+    "hardware",
+    "physics",
+    "iterations_per_call",
+    "run_dir",
+    "resume",
+    "wandb",
+    "evaluation.",
+    "checkpoint.",
+)
+"""Prefixes of settings that do not influence the trained policy."""

@@ -1,0 +1,187 @@
+"""The errors of Hydra and OmegaConf about a command line, in one line that says what to type instead."""
+
+import difflib
+import re
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from mjx_walk.algos import ALGORITHMS
+from mjx_walk.envs import TASKS
+from mjx_walk.settings.recipe_files import recipe_file, recipe_settings
+from mjx_walk.settings.recipes import fitting_recipes, recipe_names
+from mjx_walk.settings.schema import chosen, setting_types
+from mjx_walk.utils.errors import first_line
+from mjx_walk.utils.near_misses import near_misses
+from mjx_walk.utils.value_types import plain_type, type_mistake
+
+__all__ = ["explain", "unknown_key"]
+
+_ELSEWHERE = {
+    "algorithm": "algo",
+    "clip_range": "algo.clip_epsilon",
+    "env_id": "env",
+    "env_name": "env",
+    "environment": "env",
+    "folder": "run_dir",
+    "gamma": "algo.discount",
+    "hidden_sizes": "algo.policy_hidden_layer_sizes",
+    "lr": "algo.learning_rate",
+    "n_envs": "num_envs",
+    "n_epochs": "algo.num_epochs",
+    "net_arch": "algo.policy_hidden_layer_sizes",
+    "out": "run_dir",
+    "run": "run_dir",
+    "steps": "total_steps",
+    "timesteps": "total_steps",
+    "total_timesteps": "total_steps",
+    "wandb": "wandb_project",
+}
+"""Our keys for the names that other libraries and other commands have for them."""
+_GROUPS = ("hardware", "recipe")
+"""Hydra's groups that are not settings."""
+_MOST_LISTED = 8
+"""Most settings of a group that a message lists."""
+_UNKNOWN_KEY = re.compile("not in struct|not in '|Could not override")
+
+
+def explain(error: BaseException, overrides: list[str]) -> str:
+    """The line for an error. The useful detail is often in its cause.
+
+    Args:
+        error: what composing the configuration has raised.
+        overrides: the completed command line.
+    """
+    env, algo = chosen(overrides)
+    types = setting_types(env, algo)
+    given = dict(override.split("=", 1) for override in overrides if "=" in override)
+    texts = [str(error), str(error.__cause__ or "")]
+    if "raised while composing config" in texts[0]:
+        return _unfit_recipe(texts[0], given, env, algo)
+    if any(_UNKNOWN_KEY.search(text) for text in texts):
+        wrong = [key for key in given if key not in types and key not in _GROUPS]
+        if wrong:
+            return unknown_key(wrong[0], env, algo)
+    missing = re.search(r"Could not find '(\w+)/(.*?)'", texts[0])
+    if missing and missing[1] in _GROUPS:
+        return _unknown_choice(missing[1], missing[2], env, algo)
+    ambiguous = re.search(r"Ambiguous value for argument '(.*?)=(.*)'", texts[0])
+    if ambiguous:
+        return _several_values(ambiguous[1], ambiguous[2], types)
+    full_key = getattr(error, "full_key", None) or getattr(error.__cause__, "full_key", None)
+    key = re.sub(r"\[\d+\]$", "", full_key or "")
+    detail = first_line(error.__cause__ or error)
+    if key not in given or "Interpolation" in detail:
+        return f"{full_key}: {detail}" if full_key else detail
+    return type_mistake(key, given[key], types.get(key)) or f"{key}={given[key]}: {detail}"
+
+
+def unknown_key(key: str, env: str, algo: str) -> str:
+    """The error for a key that no setting has, with the settings that may be meant.
+
+    Args:
+        key: the key.
+        env: name of the task.
+        algo: name of the algorithm.
+    """
+    types = setting_types(env, algo)
+    groups = [known for known, hint in types.items() if hasattr(plain_type(hint), "__dataclass_fields__")]
+    section, _, name = key.rpartition(".")
+    settings = [known for known in types if known not in groups]
+    owners = _owners(section, name)
+    if owners and owners[0] not in settings:
+        full, having = owners
+        return f"unknown key '{key}'; {full} is a setting of {', '.join(having)}, not of {_chosen_in(full, env, algo)}"
+    near = _similar(key, settings)
+    if near:
+        return f"unknown key '{key}'; did you mean: {', '.join(near)}?"
+    own = [known for known in types if known.rpartition(".")[0] == section and section]
+    if own and len(own) <= _MOST_LISTED:
+        return f"unknown key '{key}'; choose one of: {', '.join(own)}"
+    return f"unknown key '{key}'; for the settings, see: python -m mjx_walk.train env={env} algo={algo} --cfg job"
+
+
+def _similar(key: str, known: list[str]) -> list[str]:
+    """The known keys that a key may stand for."""
+    name = key.rpartition(".")[2]
+    if _ELSEWHERE.get(name) in (*known, "env", "algo"):
+        return [_ELSEWHERE[name]]
+    same = [other for other in known if other.rpartition(".")[2] == name]
+    if same:
+        return same
+    close = difflib.get_close_matches(key, known, 3, 0.75)
+    last = {other.rpartition(".")[2]: other for other in known}
+    return list(dict.fromkeys([*close, *(last[other] for other in difflib.get_close_matches(name, last, 2, 0.75))]))
+
+
+def _owners(section: str, name: str) -> tuple[str, list[str]] | None:
+    """The full key of a setting that other algorithms or tasks have, and their names."""
+    tables: dict[str, dict[str, Any]] = {
+        "algo": {algo: config for algo, (_, config) in ALGORITHMS.items()},
+        "env": {env: options for env, (_, options) in TASKS.items()},
+    }
+    for group, schemas in tables.items():
+        having = [owner for owner, schema in schemas.items() if name in schema.__dataclass_fields__]
+        if having and section in ("", group):
+            return f"{group}.{name}", having
+    return None
+
+
+def _chosen_in(full_key: str, env: str, algo: str) -> str:
+    return algo if full_key.startswith("algo.") else env
+
+
+def _unfit_recipe(text: str, given: dict[str, str], env: str, algo: str) -> str:
+    """The error for a recipe that sets what the algorithm or the task lacks: the first line names its file."""
+    file = re.search(r"recipe/([\w/-]+)", text)
+    recipe = given.get("recipe") or (file[1] if file else "")
+    own = recipe_file(recipe.strip("'")) if recipe else None
+    if own:
+        return _mistake_in_file(own, text, env, algo)
+    meant_env, _, meant_algo = recipe.rpartition("/")[2].rpartition("_")
+    meant = [f"env={meant_env}"] if meant_env in TASKS and meant_env != env else []
+    meant += [f"algo={meant_algo}"] if meant_algo in ALGORITHMS and meant_algo != algo else []
+    hint = f"add {' '.join(meant)}" if meant else fitting_recipes(env, algo)
+    return f"recipe={recipe} does not fit env={env} algo={algo}; {hint}"
+
+
+def _mistake_in_file(recipe: Path, text: str, env: str, algo: str) -> str:
+    """The error for a recipe file of the user: an unknown key, or a value of another type."""
+    settings = list(recipe_settings(recipe))
+    choices = {"/env": env, "/algo": algo} | {key: value for _, key, value in settings if key.startswith("/")}
+    env, algo = choices["/env"], choices["/algo"]
+    types = setting_types(env, algo)
+    for file, key, value in settings:
+        if key in ("env", "algo", "hardware"):
+            return f"{file} sets {key}: {value}; write '- override /{key}: {value}' below 'defaults:'"
+        if key not in types and not key.startswith("/"):
+            return f"{file}: {unknown_key(key, env, algo)}"
+    for file, key, value in settings:
+        if f"full_key: {key}\n" in f"{text}\n":
+            return f"{file}: {type_mistake(key, str(value), types[key]) or f'{key}: {value} is not valid'}"
+    return f"{recipe} does not fit env={env} algo={algo}: {text.splitlines()[-1].strip()}"
+
+
+def _unknown_choice(group: str, value: str, env: str, algo: str) -> str:
+    """The error for a recipe, or a size of recipes, that does not exist."""
+    if group == "hardware":
+        return f"hardware={value}: choose one of: cpu, gpu"
+    own = [name for name in recipe_names() if name.endswith(f"/{env}_{algo}")]
+    nearest = near_misses(value, recipe_names())
+    near = nearest if nearest and nearest[0] not in own else _near_recipes(value, own)
+    hint = f"did you mean: {', '.join(near)}?" if near else fitting_recipes(env, algo)
+    return f"unknown recipe '{value}'; {hint}"
+
+
+def _near_recipes(value: str, names: Collection[str]) -> list[str]:
+    """The recipes of these names whose last part is the value, or that resemble it."""
+    return [name for name in names if name.rpartition("/")[2] == value] or near_misses(value, names)
+
+
+def _several_values(key: str, text: str, types: dict[str, Any]) -> str:
+    """The error for several values with commas, outside a sweep."""
+    mistake = type_mistake(key, text, types.get(key)) or ""
+    if "; write " in mistake:
+        return mistake
+    alternative = f"write seeds=[{text}]" if key == "seed" else "add -m"
+    return f"{key}={text} gives several values; give one, or {alternative} to train a run with each"

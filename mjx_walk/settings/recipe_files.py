@@ -1,0 +1,187 @@
+"""Recipes in files of the user: `recipe=PATH`."""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from mjx_walk.settings.recipes import CONFIG_DIR
+from mjx_walk.storage.files import read_bytes, user_path
+from mjx_walk.utils.errors import UserError, first_line
+
+__all__ = ["read_recipe", "recipe_file", "recipe_settings", "with_paths", "with_stored_recipes"]
+
+_RECIPES = Path(CONFIG_DIR) / "recipe"
+_SUFFIXES = (".yaml", ".yml")
+_MAX_BYTES = 1_000_000
+_SELF = "_self_"
+_paths: dict[str, Path] = {}
+"""Recipe files by the names of their nodes."""
+
+
+def recipe_file(name: str, folder: Path | None = None) -> Path | None:
+    """The file of a recipe. None for this package's recipes, and for a name that neither they nor a file has.
+
+    Args:
+        name: value of `recipe=`; the ending `.yaml` may be left out.
+        folder: what a relative path is relative to, by default the working directory.
+
+    Raises:
+        UserError: a path that leads to no file.
+    """
+    if _is_shipped(name):
+        return None
+    path = Path(os.path.abspath((folder or Path.cwd()) / user_path(name)))
+    for file in (path, path.with_name(f"{path.name}.yaml")):
+        if file.is_file():
+            return file
+    if name.startswith((".", "/", "~")) or path.suffix in _SUFFIXES:
+        found = f"'{path}' is a folder" if path.is_dir() else f"no recipe file '{path}'"
+        raise UserError(f"{found}; give the path of a YAML file, or the name of a recipe such as cpu/humanoid_ppo")
+    return None
+
+
+def _shipped_file(name: str) -> Path:
+    return _RECIPES / f"{name.removesuffix('.yaml')}.yaml"
+
+
+def _is_shipped(name: str) -> bool:
+    return not name.startswith((".", "/", "~")) and _shipped_file(name).is_file()
+
+
+def with_stored_recipes(overrides: list[str], store: ConfigStore) -> list[str]:
+    """Overrides in which recipe files have the names under which Hydra finds them in the store.
+
+    Args:
+        overrides: completed arguments of the command line.
+        store: Hydra's store; the files are read into it.
+
+    Raises:
+        UserError: a file is missing, is no recipe, or inherits from one that is not.
+    """
+    return [_with_stored_recipe(text, store) if text.startswith("recipe=") else text for text in overrides]
+
+
+def with_paths(message: str) -> str:
+    """A message of Hydra's with the paths of recipe files in place of the names of their nodes."""
+    for name, path in _paths.items():
+        message = message.replace(f"recipe/{name}", str(path)).replace(name, str(path))
+    return message
+
+
+def _with_stored_recipe(text: str, store: ConfigStore) -> str:
+    override = OverridesParser.create().parse_override(text)
+    names = []
+    for value in _values(override):
+        file = recipe_file(value)
+        names.append(_store(file, store, ()) if file else value)
+    return f"recipe={','.join(names)}" if names else text
+
+
+def _values(override: Override) -> list[str]:
+    """The names that an override gives; none for `null` and for sweeps that are no list."""
+    if override.is_choice_sweep():
+        return [value.strip("'\"") for value in override.sweep_string_iterator()]
+    value = override.value()
+    return [str(value)] if isinstance(value, str) else []
+
+
+def _store(path: Path, store: ConfigStore, above: tuple[Path, ...]) -> str:
+    """Store a recipe file and those that it inherits from. Returns the name of its node."""
+    if path in above:
+        raise UserError(f"the recipe {path} inherits from itself; correct the defaults of {above[-1]}")
+    node = read_recipe(path)
+    if "defaults" in node:
+        entries = sorted(_defaults(node, path), key=_is_override)  # Hydra wants them last
+        node.defaults = [_stored_default(entry, path, store, (*above, path)) for entry in entries]
+    name = f"own_{hashlib.sha256(os.fsencode(path)).hexdigest()[:16]}"
+    _paths[name] = path
+    store.store(group="recipe", name=name, node=node, package="_global_")
+    return name
+
+
+def _stored_default(entry: Any, path: Path, store: ConfigStore, above: tuple[Path, ...]) -> Any:
+    """An entry of a defaults list, under the name of its node if it is a file."""
+    file = _inherited_file(entry, path)
+    return _store(file, store, above) if file else entry
+
+
+def _is_override(entry: Any) -> bool:
+    return isinstance(entry, dict) and any(str(key).startswith("override ") for key in entry)
+
+
+def _inherited_file(entry: Any, path: Path) -> Path | None:
+    """The file that an entry of a defaults list names. None for Hydra's keywords.
+
+    Raises:
+        UserError: the entry names neither a file nor a recipe.
+    """
+    if not isinstance(entry, str) or entry == _SELF:
+        return None
+    shipped = entry.removeprefix("/recipe/")
+    if _is_shipped(shipped):
+        return _shipped_file(shipped)
+    file = recipe_file(entry, path.parent)
+    if file is None:
+        raise UserError(f"{path} inherits from '{entry}', which is neither a file beside it nor a recipe")
+    return file
+
+
+def _defaults(node: DictConfig, path: Path) -> list[Any]:
+    entries = node.defaults
+    if not isinstance(entries, ListConfig):
+        raise UserError(f"{path}: its defaults are not a list; write '- NAME' in a line for each")
+    return OmegaConf.to_container(entries)  # type: ignore[return-value]
+
+
+def read_recipe(path: Path) -> DictConfig:
+    """Read a recipe file.
+
+    Raises:
+        UserError: it cannot be read, is not YAML, or has no keys.
+    """
+    try:
+        node = OmegaConf.create(read_bytes(path, _MAX_BYTES).decode())
+    except OSError as error:
+        raise UserError(f"cannot read the recipe {path}: {error.strerror}") from error
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise UserError(f"the recipe {path} is not valid YAML: line {line}: {error.problem}") from error
+    except (ValueError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise UserError(f"the recipe {path} cannot be read: {first_line(error)}") from error
+    if not isinstance(node, DictConfig) or not node or any(not isinstance(key, str) for key in node):
+        raise UserError(f"the recipe {path} has no settings; write 'KEY: VALUE' in a line for each")
+    return node
+
+
+def recipe_settings(path: Path) -> Iterator[tuple[Path, str, Any]]:
+    """The settings of a recipe file and of the files that it inherits from: file, full key, value.
+
+    A choice such as `override /env: ant` has the key `/env`.
+    """
+    node = read_recipe(path)
+    for entry in _defaults(node, path) if "defaults" in node else ():
+        file = _inherited_file(entry, path)
+        if file:
+            yield from recipe_settings(file)
+        elif isinstance(entry, dict):
+            yield from ((path, f"/{key.rpartition('/')[2]}", value) for key, value in entry.items())
+    for key, value in _flat(OmegaConf.to_container(node), ""):
+        if key != "defaults":
+            yield path, key, value
+
+
+def _flat(values: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, dict) and value:
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value

@@ -1,0 +1,92 @@
+"""The settings of a run, and their types."""
+
+import dataclasses
+import typing
+from collections.abc import Iterator
+from typing import Any
+
+from mjx_walk.algos import ALGORITHMS
+from mjx_walk.envs import TASKS
+from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.envs.physics import ENGINES
+from mjx_walk.utils.setting_fields import MAX_SEED, setting
+
+__all__ = ["CheckpointConfig", "Config", "chosen", "setting_types"]
+
+
+@dataclasses.dataclass
+class CheckpointConfig:
+    """Settings of checkpoints."""
+
+    every_calls: int = setting(50, at_least=1)
+    """Program calls from one checkpoint to the next."""
+    keep: int = setting(3, at_least=1)
+    """Number of newest checkpoints to keep. Several seeds or devices keep one more until training ends. The best policy
+    is kept separately."""
+
+
+@dataclasses.dataclass
+class Config:
+    """Settings of one training run."""
+
+    env: Any = None
+    """Options of the task, see `mjx_walk.envs`."""
+    algo: Any = None
+    """Settings of the algorithm, see `mjx_walk.algos`."""
+    hardware: str = setting("gpu", choices=("gpu", "cpu"))
+    """Size of the recipe. The default follows from the devices that JAX sees."""
+    physics: str = setting("auto", choices=("auto", *ENGINES))
+    """Physics engine, see `mjx_walk.envs.physics`."""
+    seed: int = setting(0, at_least=0, at_most=MAX_SEED)
+    """Seed of all random numbers of the run."""
+    num_envs: int = setting(8192, at_least=1, at_most=2**31 - 1)
+    """Training environments on each device."""
+    total_steps: int = setting(100_000_000, at_least=1)
+    """Environment steps, summed over all environments and rounded up to a multiple of the steps of a call."""
+    iterations_per_call: int = setting(1, at_least=1)
+    """Iterations compiled into one program call. Logging, filming and saving happen between calls. With a single
+    iteration, Warp records its kernels again in most calls, because arrays that the physics reads have moved."""
+    run_dir: str | None = None
+    """Folder of the run, by default `runs/ENV_ALGO/TIME`."""
+    resume: bool = False
+    """Continue the run in `run_dir` from its newest checkpoint."""
+    wandb_project: str | None = None
+    """Weights & Biases project to log to."""
+    profile_calls: int = setting(0, at_least=0)
+    """Program calls to record with JAX's profiler, from the third one on, in the run folder's `profile`. TensorBoard
+    and Perfetto show the recording. With Warp on one GPU, record only one: recording a second call has hung."""
+    matmul_precision: str = setting("tensorfloat32", choices=("tensorfloat32", "float32"))
+    """Precision of the networks' matrix products. The physics always uses float32."""
+    evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+    checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
+
+
+def chosen(overrides: list[str]) -> tuple[str, str]:
+    """The environment and the algorithm of a command line; the default where it names none that is known.
+
+    Args:
+        overrides: arguments of the command line.
+    """
+    given = dict(override.split("=", 1) for override in overrides if "=" in override)
+    env, algo = given.get("env", "humanoid"), given.get("algo", "ppo")
+    return (env if env in TASKS else "humanoid"), (algo if algo in ALGORITHMS else "ppo")
+
+
+def setting_types(env: str, algo: str) -> dict[str, Any]:
+    """The annotation of every setting and of every group of settings, by its full key.
+
+    Args:
+        env: name of the task.
+        algo: name of the algorithm.
+    """
+    return dict(_walk(Config, "", {"env": TASKS[env][1], "algo": ALGORITHMS[algo][1]}))
+
+
+def _walk(schema: Any, prefix: str, groups: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    hints = typing.get_type_hints(schema)
+    for field in dataclasses.fields(schema):
+        key = prefix + field.name
+        hint = groups.get(key, hints[field.name])
+        yield key, hint
+        if dataclasses.is_dataclass(hint):
+            yield from _walk(hint, f"{key}.", groups)

@@ -1,0 +1,85 @@
+"""The facts stored with a checkpoint, checked before they are used: the file may come from anywhere."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mjx_walk.storage.checksums import read_json, take_checksum, with_checksum
+from mjx_walk.storage.files import write_text
+from mjx_walk.utils.errors import failed_read
+from mjx_walk.utils.versions import __version__
+
+__all__ = ["FORMAT", "read_facts", "write_facts"]
+
+FORMAT = 1
+"""Version of the checkpoint format. Increment it when a change makes older checkpoints unreadable."""
+
+_MAX_BYTES = 2_000_000
+_MAX_NUMBER = 1e300
+_REQUIRED = ("env_steps", "crc32")
+
+
+def write_facts(path: Path, facts: dict[str, Any]) -> None:
+    """Write a `meta.json`, with the versions and a checksum."""
+    facts = {"format": FORMAT, "mjx_walk": __version__} | facts
+    write_text(path, json.dumps(with_checksum(facts)))
+
+
+def read_facts(path: Path) -> dict[str, Any]:
+    """Read a `meta.json`. Facts that this version does not know are not checked.
+
+    Returns:
+        The facts. Those of another format than `FORMAT` are returned without a look at the checksum.
+
+    Raises:
+        UnreadableError: the file cannot be read now.
+        ValueError: the file is missing, a fact is not what it should be, or the checksum does not match.
+    """
+    try:
+        facts = read_json(path, _MAX_BYTES)
+    except OSError as error:
+        raise failed_read(path.parent, error) from error
+    except ValueError as error:
+        raise ValueError(f"{path.parent} is damaged: {path.name}: {error}") from error
+    if not isinstance(facts, dict):
+        raise ValueError(f"{path} should be a JSON object, found {_shown(facts)}")
+    for name, (is_valid, valid) in _FACTS.items():
+        if name in facts and not is_valid(facts[name]):
+            raise ValueError(f"{path}: {name} should be {valid}, found {_shown(facts[name])}")
+        if name in _REQUIRED and name not in facts:
+            raise ValueError(f"{path}: {name} should be {valid}, found nothing")
+    if not take_checksum(facts) and facts.get("format") == FORMAT:
+        raise ValueError(f"{path.parent} is damaged: {path.name} does not match its checksum")
+    return facts
+
+
+def _is_count(value: Any, at_least: int = 0) -> bool:
+    return type(value) is int and at_least <= value < 2**63
+
+
+def _is_finite(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) < _MAX_NUMBER
+
+
+_FACTS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "env_steps": (_is_count, "a whole number from 0"),
+    "wall_seconds": (lambda value: _is_finite(value) and value >= 0, "a number from 0"),
+    "num_devices": (lambda value: _is_count(value, 1) and value <= 10**6, "a whole number from 1 to 1,000,000"),
+    "eval_return": (_is_finite, "a finite number"),
+    "seeds_together": (lambda value: _is_count(value, 1), "a whole number from 1"),
+    "log_rows": (_is_count, "a whole number from 0"),
+    "log_crc32": (_is_count, "a whole number from 0"),
+    "config_crc32": (_is_count, "a whole number from 0"),
+    "format": (_is_count, "a whole number from 0"),
+    "mjx_walk": (lambda value: isinstance(value, str) and value.isprintable() and len(value) < 100, "a version"),
+    "crc32": (lambda value: isinstance(value, dict) and all(map(_is_count, value.values())), "whole numbers by name"),
+}
+"""Facts of a checkpoint: whether a value is valid, and what is."""
+
+
+def _shown(value: Any) -> str:
+    """The start of a value, in one line."""
+    if isinstance(value, int) and not _is_count(abs(value)):
+        return "a huge number"  # Python refuses to print it
+    return ascii(value)[:60] if isinstance(value, str | int | float | None) else f"a JSON {type(value).__name__}"

@@ -1,0 +1,136 @@
+"""Scores of a policy, and `eval_gymnasium.json`, which holds those of a run's policies in the real Gymnasium."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_walk.storage.checksums import read_json, take_checksum, with_checksum
+from mjx_walk.storage.files import write_text
+from mjx_walk.utils.versions import package_versions
+
+__all__ = ["BEST", "BETTER", "FINAL", "POLICIES", "ScoreFile", "Scores", "read_scores", "write_scores"]
+
+FINAL = "final"
+"""The policy of the newest checkpoint, at the end of the training so far."""
+BEST = "best"
+"""The policy with the highest evaluation during training or at its end."""
+POLICIES = (FINAL, BEST)
+BETTER = "better"
+"""The better of both, chosen on the scored episodes themselves: what a file with one block holds."""
+
+_MAX_NUMBER = 1e300
+_MAX_BYTES = 10_000_000
+"""About 125,000 episodes of both policies."""
+
+
+@dataclasses.dataclass
+class Scores:
+    """Undiscounted returns and lengths of complete episodes."""
+
+    returns: np.ndarray
+    """`[N] f64`."""
+    lengths: np.ndarray
+    """`[N] i64`."""
+    seeds: list[int]
+    """In Gymnasium the seed of each episode's reset; in an engine the one seed of all episodes."""
+    env: str
+    """Gymnasium's name, followed by the engine if it is not Gymnasium's."""
+
+    @property
+    def mean(self) -> float:
+        return float(self.returns.mean())
+
+    @property
+    def std(self) -> float:
+        """The sample's standard deviation over episodes (n − 1); 0 for one episode."""
+        return float(self.returns.std(ddof=1)) if len(self.returns) > 1 else 0.0
+
+    def __str__(self) -> str:
+        count = len(self.returns)
+        return (
+            f"{self.env}: {self.mean:,.1f} ± {self.std:,.1f} over {count} {'episode' if count == 1 else 'episodes'}, "
+            f"mean length {self.lengths.mean():,.1f}, lowest {self.returns.min():,.1f}"
+        )
+
+    def block(self, **facts: Any) -> dict[str, Any]:
+        """All episodes and their mean and deviation, for `write_scores`.
+
+        Args:
+            facts: JSON-serializable facts about the policy, such as `env_steps`.
+        """
+        return {
+            "mean": self.mean,
+            "std": self.std,
+            "returns": self.returns.tolist(),
+            "lengths": self.lengths.tolist(),
+            "seeds": self.seeds,
+            **facts,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class ScoreFile:
+    """Contents of an `eval_gymnasium.json`."""
+
+    env: str
+    """Gymnasium's id of the environment."""
+    blocks: dict[str, dict[str, Any]]
+    """`Scores.block` of each scored policy, by its name: `final`, `best`, or `better` in a file with one block."""
+    facts: dict[str, Any]
+    """Everything else, such as `versions`, `wall_seconds` and `command`."""
+
+    def block(self, *names: str) -> dict[str, Any] | None:
+        """The first block that the file has of these names."""
+        return next((self.blocks[name] for name in names if name in self.blocks), None)
+
+
+def write_scores(path: Path, env: str, blocks: dict[str, dict[str, Any]], facts: Mapping[str, Any]) -> None:
+    """Write scores as JSON, with the versions of the packages and a checksum.
+
+    Args:
+        path: file to replace.
+        env: Gymnasium's id of the environment.
+        blocks: `Scores.block` of each scored policy, by its name.
+        facts: JSON-serializable facts about the run. They do not replace the scores, whatever their names are.
+    """
+    scores = {"env": env, **blocks}
+    others = {name: fact for name, fact in facts.items() if name not in scores}
+    content = scores | others | {"versions": package_versions()}
+    write_text(path, json.dumps(with_checksum(content), indent=1))
+
+
+def read_scores(path: Path) -> ScoreFile:
+    """Read scores that `write_scores` wrote. A file with one block, of an older version, loads as well.
+
+    Raises:
+        ValueError: the file is not of this format, or was changed.
+        OSError: it is not a regular file, or cannot be read.
+    """
+    try:
+        content = read_json(path, _MAX_BYTES)
+    except ValueError as error:
+        raise ValueError(f"{path} holds no scores: {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} holds no object")
+    if not take_checksum(content):
+        raise ValueError(f"{path} was changed after it was written: its checksum does not match")
+    env = content.pop("env", "")
+    if "returns" in content:  # one block, without a name
+        names = ("mean", "std", "returns", "lengths", "seeds", "env_steps")
+        blocks = {BETTER: {name: content.pop(name) for name in names if name in content}}
+    else:
+        blocks = {name: content.pop(name) for name in (*POLICIES, BETTER) if name in content}
+    for name, block in blocks.items():
+        if not (isinstance(block, dict) and _are_numbers(block.get("mean"), block.get("std"))):
+            raise ValueError(f"{path} has no mean and std of the policy '{name}'")
+    if not isinstance(env, str) or not blocks:
+        raise ValueError(f"{path} holds no scores")
+    return ScoreFile(env, blocks, content)
+
+
+def _are_numbers(*values: Any) -> bool:
+    return all(type(value) in (int, float) and abs(value) < _MAX_NUMBER for value in values)

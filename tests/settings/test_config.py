@@ -1,0 +1,292 @@
+"""Configurations: every recipe composes and fits its algorithm; what is saved is what is read."""
+
+import dataclasses
+import functools
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from mjx_walk import train as train_command
+from mjx_walk.algos import ALGORITHMS, make_algorithm
+from mjx_walk.api import make_task, resolve
+from mjx_walk.envs import TASKS
+from mjx_walk.experiments import planned_runs
+from mjx_walk.settings.config import CONFIG_DIR, flatten, load_config, recipe_names, training_command
+from mjx_walk.settings.saved_config import read_config, save_config
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.setting_fields import describe, has_effect
+
+RECIPES = sorted(
+    str(path.relative_to(f"{CONFIG_DIR}/recipe"))[:-5] for path in Path(CONFIG_DIR).glob("recipe/?pu/[!_]*.yaml")
+)
+ALL_RECIPES = recipe_names()
+
+LONGER_SCHEDULES = {"cpu/humanoid_ppo": 3_000_000}
+"""Of the recipes that end before their schedule. All others anneal to the end."""
+
+SCHEDULES = ("learning_rate_schedule", "entropy_schedule", "final_discount", "final_target_entropy")
+
+
+@functools.cache
+def load_recipe(recipe):
+    """Composing takes a tenth of a second."""
+    folder, _, name = recipe.partition("/")
+    env, _, algo = name.rpartition("_")
+    task = [] if folder == "report" else [f"env={env}", f"algo={algo}"]
+    chosen = [f"hardware={folder}"] if recipe in RECIPES else [f"recipe={recipe}"]
+    return load_config([*task, *chosen, "physics=c"])
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_every_recipe_fits(recipe):
+    hardware, _, name = recipe.partition("/")
+    env, _, algo = name.rpartition("_")
+    config = load_recipe(recipe)
+    assert (config.env.name, config.algo.name, config.hardware) == (env, algo, hardware)
+    if any(getattr(config.algo, name, None) not in (None, "constant") for name in SCHEDULES):
+        assert config.algo.schedule_steps == LONGER_SCHEDULES.get(recipe, config.total_steps)
+    algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
+    assert algorithm.steps_per_iteration * config.iterations_per_call < config.total_steps / 20
+
+
+def test_there_is_a_recipe_for_every_task_on_every_hardware():
+    assert len(RECIPES) == 2 * len(TASKS) * len(ALGORITHMS)
+
+
+def settings_of(path):
+    """All keys that a recipe and the recipes below it set."""
+    content = yaml.safe_load(path.read_text())
+    parents = [name for name in content.pop("defaults", []) if isinstance(name, str) and name != "_self_"]
+    keys = [f"{key}.{name}" for key, value in content.items() if isinstance(value, dict) for name in value]
+    keys += [key for key, value in content.items() if not isinstance(value, dict)]
+    for parent in parents:
+        folder, _, name = parent.rpartition("/")
+        keys += settings_of(path.parents[1] / (Path(folder).name or path.parent.name) / f"{name}.yaml")
+    return keys
+
+
+@pytest.mark.parametrize("recipe", ALL_RECIPES)
+def test_no_recipe_gives_a_setting_without_effect(recipe):
+    config = load_recipe(recipe)
+    given = settings_of(Path(CONFIG_DIR) / "recipe" / f"{recipe}.yaml")
+    assert len(given) > 5 and [key for key in given if not has_effect(config, key)] == []
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in Path(CONFIG_DIR).glob("recipe/report/*.yaml")))
+def test_the_reports_recipes_name_their_own_task_and_algorithm(name):
+    config = load_config([f"recipe=report/{name}"])
+    report, algo = name.split("_")[:2]
+    task = {"a": "humanoid", "b": "humanoid", "c": "humanoid", "d": "humanoid_standup", "e": "walker2d"}[report]
+    assert (config.algo.name, config.env.name) == (algo, task) and config.env.version == (
+        "v5" if report == "e" else "v4"
+    )
+    algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
+    assert algorithm.steps_per_iteration * config.iterations_per_call < config.total_steps / 20
+    if name in ("c_sac", "d_ddpg", "d_sac", "e_td3"):
+        assert config.evaluation.num_envs == 10 and algorithm.steps_per_iteration == config.num_envs
+
+
+def test_the_recipe_for_speed_gathers_four_times_the_steps_and_goes_through_them_half_as_often():
+    usual, fast = (load_config(["hardware=gpu", f"recipe={folder}/humanoid_ppo"]) for folder in ("gpu", "speed"))
+    algorithms = [make_algorithm(make_task(c), c.num_envs, c.evaluation, c.algo) for c in (usual, fast)]
+    assert algorithms[1].steps_per_iteration == 4 * algorithms[0].steps_per_iteration
+    assert 2 * fast.algo.num_epochs == usual.algo.num_epochs and fast.algo.schedule_steps == fast.total_steps
+
+
+def test_the_first_reports_observation_has_378_numbers():
+    assert make_task(load_config(["recipe=report/a_a2c"])).observation_size == 378
+
+
+def test_without_an_accelerator_the_small_recipe_is_chosen():
+    assert load_config([]).hardware == "cpu" and load_config(["hardware=gpu"]).num_envs == 16384
+    assert load_config([]).num_envs == load_config(["hardware=cpu"]).num_envs == 128
+
+
+def test_overrides_beat_the_recipe(tmp_path):
+    config = load_config(["env=walker2d", "num_envs=32", "algo.discount=0.9", "env.healthy_z_range=[0.5, 3]"])
+    assert (config.num_envs, config.algo.discount, config.env.healthy_z_range) == (32, 0.9, (0.5, 3.0))
+    save_config(config, tmp_path / "config.yaml")
+    assert flatten(read_config(tmp_path / "config.yaml")) == flatten(config)
+    humanoid = load_config(["env.version=v4"])
+    save_config(humanoid, tmp_path / "config.yaml")  # with its infinite contact_cost_range
+    assert read_config(tmp_path / "config.yaml") == humanoid
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("_target_: os.system", "defaults: [train]", "hydra: {run: {dir: /tmp/x}}", "seed: {a: 1}", "seed: [1]"),
+        *("env: {name: walker2d, _target_: os.system}", "env: {name: walker2d, shaping: 7}", "num_envs: 1e99"),
+        *("env: {name: walker2d, shaping: {deep: {er: 1}}}", "algo: {name: ppo, policy_hidden_layer_sizes: x}"),
+        *("algo: {name: __class__}", "env: null", "evaluation: null", "total_steps: .nan", "resume: maybe"),
+        *("checkpoint: {every_calls: 0}", "matmul_precision: high", "env: {name: walker2d, healthy_z_range: [a]}"),
+    ],
+)
+def test_any_line_of_a_strangers_configuration_costs_one_line(tmp_path, line):
+    save_config(load_config(["env=walker2d", "algo=ppo", "hardware=cpu"]), tmp_path / "config.yaml")
+    saved = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    for key, value in yaml.safe_load(line).items():
+        saved[key] = saved[key] | value if isinstance(value, dict) and key in ("env", "algo", "checkpoint") else value
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(saved))
+    with pytest.raises(UserError) as error:
+        make_task(read_config(tmp_path / "config.yaml"))
+    assert "\n" not in str(error.value)
+
+
+FORMER = ["algo.entropy_cost=0.25", "updates_per_chunk=3", "checkpoint.every_chunks=7"]
+PRESENT = {"algo.entropy_coef": 0.25, "iterations_per_call": 3, "checkpoint.every_calls": 7}
+
+
+def renamings(warned):
+    return [str(warning.message) for warning in warned if " is now " in str(warning.message)]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (b"run_dir: ${oc.env:HOME}\n", r"line 1 of .* contains '\$\{', which no saved configuration does"),
+        (b'run_dir: "\\x24{oc.env:HOME}"\n', r"line 1 of .* contains '\$\{'"),
+        (b'run_dir: "$\\u007boc.env:HOME}"\n', r"line 1 of .* contains '\$\{'"),
+        (b'run_dir: "$\\\n  {oc.env:HOME}"\n', r"line 1 of .* contains '\$\{'"),
+        (b"\xff\xfe", "is not a configuration of this version"),
+        (b"run_dir: [\n", "is not a configuration of this version"),
+        (b"seed: 1\n", "is not a configuration of this version"),
+        (b"- 1\n", "is not a configuration of this version"),
+        (b"just text\n", "is not a configuration of this version"),
+        (b"", "is not a configuration of this version"),
+        (b"env:\n  name: [walker2d]\nalgo:\n  name: ppo\n", "is not a configuration of this version"),
+        (b"[" * 1500, "is not a configuration of this version"),
+        (b"a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n", "line 1 of .*config.yaml has an anchor"),
+        (b"a: *a\n", "line 1 of .*config.yaml has an alias"),
+        (b"seed: 1\nrun_dir: !!python/object/apply:os.system ['touch ran']\n", "line 2 of .*config.yaml has a tag"),
+        (b"run_dir: !!python/object/apply:pathlib.PosixPath [x]\n", "has a tag"),
+        (b'run_dir: "a\\e[2Jb"\n', "line 1 of .*config.yaml has characters that cannot be printed"),
+        ("run_dir: a\u202eb\n".encode(), "has characters that cannot be printed"),
+        (b"#" * 100_001, "is larger than 100,000 bytes"),
+    ],
+)
+def test_a_strangers_configuration_is_refused_in_one_line(tmp_path, text, says):
+    (tmp_path / "config.yaml").write_bytes(text)
+    with pytest.raises(UserError, match=says) as error:
+        read_config(tmp_path / "config.yaml")
+    assert "\n" not in str(error.value)
+
+
+def test_a_former_name_works_on_a_command_line_and_warns_once(recwarn):
+    config = flatten(resolve(FORMER))
+    assert PRESENT.items() <= config.items()
+    assert len(renamings(recwarn)) == 3
+    assert renamings(recwarn)[0] == "algo.entropy_cost is now algo.entropy_coef; the former name still works"
+
+
+def test_a_former_name_works_in_a_sweep(recwarn, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    trained = []
+    monkeypatch.setattr(train_command, "train", lambda configs: (trained.append(configs[0]), None))
+    monkeypatch.setattr(sys, "argv", ["train"])
+    train_command.main(["-m", "algo.entropy_cost=0,0.25", "updates_per_chunk=3"])
+    assert [config.algo.entropy_coef for config in trained] == [0, 0.25]
+    assert {config.iterations_per_call for config in trained} == {3} and len(renamings(recwarn)) == 2
+
+
+def test_a_former_name_works_in_a_comparison(recwarn, tmp_path):
+    _, planned = planned_runs.plan(["algo.entropy_cost=0,0.25"], ["ppo"], [0], str(tmp_path), "cpu")
+    assert [run.variant for run in planned] == ["ppo_entropy_coef-0", "ppo_entropy_coef-0.25"]
+    assert len(renamings(recwarn)) == 1
+
+
+def test_former_names_in_a_saved_configuration_load_silently_and_a_resumed_run_may_be_given_one(recwarn, tmp_path):
+    config = load_config(["algo.entropy_coef=0.25", "iterations_per_call=3", "checkpoint.every_calls=7"])
+    save_config(config, tmp_path / "config.yaml")
+    saved = (tmp_path / "config.yaml").read_text()
+    for old, new in (
+        ("entropy_cost", "entropy_coef"),
+        ("updates_per_chunk", "iterations_per_call"),
+        ("every_chunks", "every_calls"),
+    ):
+        assert f"{new}:" in saved
+        saved = saved.replace(f"{new}:", f"{old}:")
+    (tmp_path / "config.yaml").write_text(saved)
+    assert read_config(tmp_path / "config.yaml") == config and not renamings(recwarn)
+    resumed = resolve([f"run_dir={tmp_path}", "resume=true", "algo.entropy_cost=0.5", "algo=ppo"])
+    assert resumed.algo.entropy_coef == 0.5 and len(renamings(recwarn)) == 1
+    resumed = resolve([f"run_dir={tmp_path}", "resume=true", "algo.entropy_cost=0.75"])
+    assert resumed.algo.entropy_coef == 0.75 and resumed.iterations_per_call == 3
+
+
+def test_a_given_setting_without_effect_is_refused_unless_a_run_is_resumed(tmp_path, monkeypatch):
+    given, constant, linear = (
+        "algo.schedule_steps=7",
+        "algo.learning_rate_schedule=constant",
+        "algo.learning_rate_schedule=linear",
+    )
+    message = (
+        "algo.schedule_steps=7 has no effect with algo.learning_rate_schedule=constant and "
+        "algo.entropy_schedule=constant; change that, or leave it out"
+    )
+    with pytest.raises(UserError, match=message):
+        resolve([given, constant])
+    assert resolve([given, linear]).algo.schedule_steps == 7
+    config = load_config([constant])  # a recipe sets it, which is no mistake
+    assert "algo.schedule_steps" not in training_command(dataclasses.replace(config, seed=1))
+    config.algo.schedule_steps = 7
+    save_config(config, tmp_path / "config.yaml")
+    for further in ([], [given], ["env=humanoid", "algo=ppo", given, constant]):
+        assert resolve([f"run_dir={tmp_path}", "resume=true", *further]).algo.schedule_steps == 7
+
+
+def test_a_job_of_a_sweep_whose_setting_has_no_effect_is_refused(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    trained = []
+    monkeypatch.setattr(train_command, "train", lambda configs: (trained.append(configs[0]), None))
+    monkeypatch.setattr(sys, "argv", ["train"])
+    with pytest.raises(UserError, match="has no effect with"):
+        train_command.main(["-m", "algo.schedule_steps=7", "algo.learning_rate_schedule=linear,constant"])
+    assert [config.algo.learning_rate_schedule for config in trained] == ["linear"]
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_the_help_lists_an_algorithm_s_settings_and_where_they_have_an_effect(algo, capsys):
+    train_command.main([f"algo={algo}", "--help"])
+    text = capsys.readouterr().out
+    for line in describe(ALGORITHMS[algo][1], "algo."):
+        assert line in text
+    assert "algo.name=" not in text
+    assert "only with learning_rate_schedule other than constant or " in text
+    assert ("algo.gae_lambda" in text) == (algo in ("ppo", "a2c"))
+
+
+WITHOUT_EFFECT = {
+    "algo=ppo algo.entropy_coef=0 algo.entropy_schedule=linear": "algo.entropy_coef=0.0",
+    "algo=ppo algo.target_kl=0.1": "algo.learning_rate_schedule=linear",
+    "algo=ppo algo.state_dependent_std=true": "algo.distribution=tanh_normal",
+    "algo=ppo algo.init_noise_std=0.1": "algo.distribution=tanh_normal",
+    "algo=a2c algo.init_noise_std=0.1 algo.state_dependent_std=true": "algo.state_dependent_std=true",
+    "algo=a2c algo.mean_bound_coef=2 algo.distribution=tanh_normal": "algo.distribution=tanh_normal",
+    "algo=a2c algo.ou_noise_theta=0.1": "algo.ou_noise_std=0.0",
+    "algo=td3 algo.target_noise_clip=0.1 algo.target_noise=0": "algo.target_noise=0.0",
+    "algo=sac algo.normalized_return_max=3": "algo.normalize_rewards=false",
+    "algo=sac algo.learning_rate_schedule=constant algo.schedule_steps=9": "algo.final_target_entropy=null",
+}
+
+
+@pytest.mark.parametrize(("overrides", "reason"), WITHOUT_EFFECT.items())
+def test_a_given_setting_without_effect_names_what_disables_it(overrides, reason):
+    with pytest.raises(UserError, match=rf"has no effect with .*{re.escape(reason)}; change that, or leave it out"):
+        load_config(overrides.split())
+
+
+def test_settings_that_have_an_effect_are_not_refused():
+    load_config(["algo=csac", "algo.normalize_rewards=false", "algo.normalized_return_max=3"])
+    load_config(
+        ["algo=sac", "algo.learning_rate_schedule=constant", "algo.final_discount=0.9", "algo.schedule_steps=9"]
+    )
+    load_config(["algo=ppo", "algo.distribution=normal", "algo.init_noise_std=0.1"])
+
+
+def test_reinforce_refuses_the_settings_of_a_value_network():
+    with pytest.raises(UserError, match=r"algo\.gae_lambda=0\.9 has no effect here; leave it out"):
+        load_config(["algo=reinforce", "algo.gae_lambda=0.9"])
