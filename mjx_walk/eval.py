@@ -50,7 +50,7 @@ def main(command_line: list[str]) -> None:
     if is_saved:
         parsing.check_writable(folder.gymnasium_scores)
     scores = run.evaluate(arguments.episodes, arguments.backend, arguments.seed)
-    print(*score_lines({run.policy_name: (scores, run.policy_facts["env_steps"])}))
+    print(*score_lines({run.policy_name: (scores, run.policy_metadata["env_steps"])}))
     if arguments.policy is None and len(kept_policies(folder)) > 1:
         print(choice_line(run.policy_name))
     if is_saved:
@@ -59,15 +59,15 @@ def main(command_line: list[str]) -> None:
 
 def _save(folder: RunFolder, run: Run, scores: Scores) -> None:
     """Replace the policy's block of `eval_gymnasium.json`, and keep the other policy's."""
-    blocks, facts = {}, {}
+    blocks, metadata = {}, {}
     if folder.gymnasium_scores.exists():
         try:
             former = read_scores(folder.gymnasium_scores)
-            blocks, facts = former.blocks, former.facts
+            blocks, metadata = former.blocks, former.metadata
         except ValueError as error:
             warnings.warn(f"{error}; it is replaced", stacklevel=2)
-    own = {run.policy_name: scores.block(**run.policy_facts)}
-    write_scores(folder.gymnasium_scores, scores.env, blocks | own, facts)
+    own = {run.policy_name: scores.block(**run.policy_metadata)}
+    write_scores(folder.gymnasium_scores, scores.env, blocks | own, metadata)
 
 
 if __name__ == "__main__":

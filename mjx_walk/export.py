@@ -56,7 +56,7 @@ def main(command_line: list[str]) -> None:
     with replacing(path) as new:
         onnx.save(model, str(new))
     print(f"{path}: observation [N, {run.task.observation_size}] → action [N, {run.task.action_size}]")
-    print(f"It holds the {run.policy_name} policy (step {run.policy_facts['env_steps']:,}).")
+    print(f"It holds the {run.policy_name} policy (step {run.policy_metadata['env_steps']:,}).")
     if arguments.policy is None and len(kept_policies(folder)) > 1:
         print(choice_line(run.policy_name))
 

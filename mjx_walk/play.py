@@ -83,7 +83,7 @@ def main(command_line: list[str]) -> None:
         episode = record_episode(run.task, run.policy, arguments.seed, size)
         shown = _shown(arguments, float(episode.seconds[-1]))
         print(
-            f"{run.policy_name.title()} policy (step {run.policy_facts['env_steps']:,}), {episode.env}: "
+            f"{run.policy_name.title()} policy (step {run.policy_metadata['env_steps']:,}), {episode.env}: "
             f"return {episode.rewards.sum():,.1f} in {len(episode.rewards)} steps"
         )
         if film:

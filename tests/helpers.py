@@ -24,7 +24,7 @@ from mjx_walk.envs import registry
 from mjx_walk.settings.config import load_config
 from mjx_walk.settings.saved_config import save_config
 from mjx_walk.storage import checkpoint
-from mjx_walk.storage.checkpoint_metadata import read_facts, write_facts
+from mjx_walk.storage.checkpoint_metadata import read_metadata, write_metadata
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing import rendering
 
@@ -227,7 +227,7 @@ def edit_config(run_dir, old, new):
         path.write_text(text.replace(old, new))
         meta = path.parent / "meta.json"
         if meta.exists():
-            write_facts(meta, read_facts(meta) | {"config_crc32": zlib.crc32(path.read_bytes())})
+            write_metadata(meta, read_metadata(meta) | {"config_crc32": zlib.crc32(path.read_bytes())})
 
 
 @contextlib.contextmanager

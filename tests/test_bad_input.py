@@ -210,8 +210,8 @@ def test_resume_names_the_keys_that_differ(finished):
         train_command.main([*same, "algo.discount=0.5", "seed=9"])
     assert "algo.discount (was 0.99, now 0.5)" in str(error.value) and "seed (was 0, now 9)" in str(error.value)
     with pytest.raises(UserError) as error:
-        train_command.main([f"run_dir={finished}", "resume=true", "checkpoint.keep=5"])
-    assert ": checkpoint.keep (was 3, now 5); give only run_dir and resume=true to continue" in str(error.value)
+        train_command.main([f"run_dir={finished}", "resume=true", "checkpoint.max_to_keep=5"])
+    assert ": checkpoint.max_to_keep (was 3, now 5); give only run_dir and resume=true to continue" in str(error.value)
     with pytest.raises(UserError, match="may only grow"):
         train_command.main([*same[:-1], f"total_steps={TINY_CALL}"])
     with pytest.raises(

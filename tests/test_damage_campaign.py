@@ -52,15 +52,15 @@ class Examiner:
         found += differences(self.config, config, [key for key in MAY_DIFFER if key != "total_steps"])
         with prepared([config]) as (folders, _):
             recorder = Recorder(config, self.task, self.algorithm, folders[0], Processes())
-            state, facts = recorder.restore(self.like)
-            recorder.begin(facts["env_steps"], will_train=False)
+            state, metadata = recorder.restore(self.like)
+            recorder.begin(metadata["env_steps"], will_train=False)
             recorder.close()
-        found += [] if facts["env_steps"] == max(self.states) else ["an older checkpoint"]
-        found += [] if _same(state, self.states[facts["env_steps"]]) else ["another state"]
+        found += [] if metadata["env_steps"] == max(self.states) else ["an older checkpoint"]
+        found += [] if _same(state, self.states[metadata["env_steps"]]) else ["another state"]
         found += [] if read_rows(run_dir / "metrics.jsonl") == self.rows else ["other rows"]
-        for name, (params, policy_facts) in self.policies.items():
+        for name, (params, policy_metadata) in self.policies.items():
             other = saved_policies._load(folders[0], saved_policies.choose_policy(folders[0], name), self.algorithm)
-            found += [] if _same(other[0], params) and other[1] == policy_facts else [f"another {name} policy"]
+            found += [] if _same(other[0], params) and other[1] == policy_metadata else [f"another {name} policy"]
         return found
 
     def scores_differ_in_silence(self, run_dir):

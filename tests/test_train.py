@@ -89,7 +89,7 @@ def test_gymnasium_scores_are_those_of_a_plain_loop(finished, name):
     content = json.loads((run.path / "eval_gymnasium.json").read_text())
     assert content["env"] == "Walker2d-v5" and "mujoco" in content["versions"]
     block, policy = content[name], mjx_walk.load_run(run.path, policy=name)
-    assert block["seeds"] == [0, 1, 2] and block["env_steps"] == policy.policy_facts["env_steps"]
+    assert block["seeds"] == [0, 1, 2] and block["env_steps"] == policy.policy_metadata["env_steps"]
     for seed, expected, length in zip(block["seeds"], block["returns"], block["lengths"], strict=True):
         env = gymnasium.make("Walker2d-v5", max_episode_steps=40)
         obs, _ = env.reset(seed=seed)
@@ -153,7 +153,7 @@ def test_eval_command(finished, capsys):
 
 def test_export_says_which_policy_it_takes(finished, tmp_path, capsys):
     run, _ = finished
-    steps = {name: mjx_walk.load_run(run.path, policy=name).policy_facts["env_steps"] for name in ("final", "best")}
+    steps = {name: mjx_walk.load_run(run.path, policy=name).policy_metadata["env_steps"] for name in ("final", "best")}
     choice = "The best policy has the highest evaluation during training. eval scores the final one: policy=final"
     for arguments, name, said in (([], "best", [choice]), (["policy=final"], "final", [])):
         assert command_here("export", f"run={run.path}", f"out={tmp_path}/policy.onnx", *arguments) == 0

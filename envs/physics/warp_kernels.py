@@ -22,7 +22,7 @@ from mujoco.mjx.third_party import mujoco_warp
 
 from mjx_walk.storage.files import is_writable_folder, user_folder
 
-_log = logging.getLogger("mjx_walk.progress")
+_LOGGER = logging.getLogger("mjx_walk.progress")
 
 _SECONDS_BETWEEN_MESSAGES = 5.0
 _NUM_THREADS = 8
@@ -94,7 +94,7 @@ class _Progress:
             self._num_loaded += 1
             if time.monotonic() - self._said_at > _SECONDS_BETWEEN_MESSAGES:
                 self._said_at = time.monotonic()
-                _log.info("Warp has compiled %d of %d modules of kernels", self._num_loaded, self._num_modules)
+                _LOGGER.info("Warp has compiled %d of %d modules of kernels", self._num_loaded, self._num_modules)
 
 
 def launched_variants(model: mujoco.MjModel, njmax: int) -> Variants:

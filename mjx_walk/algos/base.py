@@ -13,7 +13,7 @@ from mjx_walk.envs import Task
 from mjx_walk.envs.inline_evaluation import EvaluationConfig, InlineEvaluation, InlineEvaluator
 from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.envs.vector_env import VectorEnv, VectorState
-from mjx_walk.utils.types import ITERATION_COUNT, PER_DEVICE, RANDOM_KEY, Metrics, PolicyFn, mark_flags
+from mjx_walk.utils.types import ITERATION_COUNT, PER_DEVICE, RANDOM_KEY, Metrics, PolicyFn, leaves_with
 
 
 class TrainState(flax.struct.PyTreeNode):
@@ -35,7 +35,7 @@ def learned_leaves(state: TrainState) -> dict[str, jax.Array]:
     leaves = jax.tree_util.tree_leaves_with_path(state)
     return {
         jax.tree_util.keystr(path, simple=True, separator="."): leaf
-        for (path, leaf), is_per_device in zip(leaves, mark_flags(state, "per_device"), strict=True)
+        for (path, leaf), is_per_device in zip(leaves, leaves_with(state, "per_device"), strict=True)
         if not is_per_device and jnp.issubdtype(leaf.dtype, jnp.floating)
     }
 

@@ -219,13 +219,13 @@ class OffPolicyAlgorithm(Algorithm):
             key=key,
             iterations=state.iterations + 1,
         )
-        facts = {
+        counts = {
             "critic_updates": jnp.float32(new_state.critic_updates),
             "replay_transitions": jnp.minimum(replay.rows, self.buffer.num_rows) * jnp.float32(self.num_envs),
             "reward_scale": reward_scale,
         }
         learned = {name: metric.only_if(can_learn) for name, metric in as_means(metrics).items()}
-        return new_state, env_metrics | learned | as_means(facts)
+        return new_state, env_metrics | learned | as_means(counts)
 
     def _train(
         self,

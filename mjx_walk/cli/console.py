@@ -88,7 +88,7 @@ class _OneLineOnce:
 
 
 def _is_not_about_gpus(record: logging.LogRecord) -> bool:
-    """Whether a message of JAX is not the one of a GPU that it does not use; `machine.nvidia` says why and what to do."""
+    """Whether a message of JAX is not the one of a GPU that it does not use. `machine.nvidia` says why."""
     return not record.getMessage().startswith(("An NVIDIA GPU may be present", "CUDA backend failed to initialize"))
 
 

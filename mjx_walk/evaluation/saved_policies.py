@@ -66,7 +66,7 @@ class SavedPolicy:
         warn_of_changed_inputs(folder, saved.env)
         self.policy_name = choose_policy(folder, policy)
         """`final` or `best`."""
-        self.policy_params, self.policy_facts = _load(folder, self.policy_name, self.algorithm)
+        self.policy_params, self.policy_metadata = _load(folder, self.policy_name, self.algorithm)
 
     def _build(self) -> None:
         engine = self._physics or _engine_here(self.config.physics)
@@ -182,13 +182,13 @@ def _load(folder: RunFolder, name: str, algorithm: Algorithm) -> tuple[Any, dict
         return load_policy(folder, name, jax.eval_shape(algorithm.policy_params, state))
     except UserError as error:
         try:
-            state, facts = checkpoint.restore_newest(folder.checkpoints, without_replay(state))
+            state, metadata = checkpoint.restore_newest(folder.checkpoints, without_replay(state))
         except UserError:
             raise error from None
-        warnings.warn(f"{error}; the policy of the checkpoint at step {facts['env_steps']:,} is used", stacklevel=2)
-    num_devices = facts.get("num_devices", 1)
+        warnings.warn(f"{error}; the policy of the checkpoint at step {metadata['env_steps']:,} is used", stacklevel=2)
+    num_devices = metadata.get("num_devices", 1)
     best = best_policy(state, algorithm.steps_per_iteration * num_devices) if name == BEST else None
-    return best or (algorithm.policy_params(state), {"env_steps": facts["env_steps"]})
+    return best or (algorithm.policy_params(state), {"env_steps": metadata["env_steps"]})
 
 
 def load_policy(folder: RunFolder, name: str, like: Any) -> tuple[Any, dict[str, Any]]:
@@ -210,7 +210,7 @@ def load_policy(folder: RunFolder, name: str, like: Any) -> tuple[Any, dict[str,
 
 
 def best_policy(state: TrainState, steps_per_iteration: int) -> tuple[Any, dict[str, Any]] | None:
-    """Policy with the highest inline evaluation, and its facts. None until the first evaluation ends.
+    """Policy with the highest inline evaluation, and its metadata. None until the first evaluation ends.
 
     Args:
         state: a TrainState.

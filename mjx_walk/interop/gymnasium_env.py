@@ -18,11 +18,11 @@ from mjx_walk.interop.gymnasium_programs import is_forked, make_programs, refuse
 from mjx_walk.interop.mujoco_attributes import (
     RENDER_MODES,
     MujocoAttributes,
-    make_twin,
+    make_gymnasium_env,
     split_keywords,
 )
 
-_NOT_PICKLED = ("_twin", "_snapshot", "_programs")
+_NOT_PICKLED = ("_gymnasium_env", "_snapshot", "_programs")
 
 
 class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
@@ -48,15 +48,16 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
         self._physics = physics
         self._state: State | None = None
         self._build()
-        self.metadata = self._twin.metadata | {"render_fps": round(1.0 / self._twin.dt)}
-        self.render_mode = self._twin.render_mode
-        self.observation_space, self.action_space = self._twin.observation_space, self._twin.action_space
+        self.metadata = self._gymnasium_env.metadata | {"render_fps": round(1.0 / self._gymnasium_env.dt)}
+        self.render_mode = self._gymnasium_env.render_mode
+        self.observation_space = self._gymnasium_env.observation_space
+        self.action_space = self._gymnasium_env.action_space
 
     def _build(self) -> None:
         if not is_forked():  # a vectorizer may first ask a worker for its spaces
             self._programs = make_programs(self._options, self._physics)
-        self._twin = make_twin(self._options, self._rendering)
-        self._snapshot = ModelSnapshot(self._twin.model)
+        self._gymnasium_env = make_gymnasium_env(self._options, self._rendering)
+        self._snapshot = ModelSnapshot(self._gymnasium_env.model)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Start an episode. A seed gives the start that it gives in Gymnasium, and determines all later episodes.
@@ -67,9 +68,9 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
         refuse_fork()
         self._snapshot.refuse_changes()
         super().reset(seed=seed)
-        self._twin.np_random = self.np_random
-        self._twin.reset()  # with render_mode="human", it shows the frame as well
-        data = self._twin.data
+        self._gymnasium_env.np_random = self.np_random
+        self._gymnasium_env.reset()  # with render_mode="human", it shows the frame as well
+        data = self._gymnasium_env.data
         self._state, info = self._programs.reset_to(np.float32(data.qpos), np.float32(data.qvel))
         return np.array(self._state.obs, np.float64), single_info(jax.device_get(info))
 
@@ -87,7 +88,7 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
         self._snapshot.refuse_changes()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        check_action_shape(action, (self._twin.model.nu,))
+        check_action_shape(action, (self._gymnasium_env.model.nu,))
         self._state, info = self._programs.step(self._state, np.asarray(action, np.float32))
         state, info = jax.device_get((self._state, info))
         if self.render_mode == "human":
@@ -98,7 +99,7 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
 
     def close(self) -> None:
         """Close the windows and OpenGL contexts."""
-        self._close_twin()
+        self._close_gymnasium_env()
 
     def _read_state(self) -> State | None:
         return self._state

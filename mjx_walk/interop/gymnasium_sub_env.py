@@ -20,8 +20,8 @@ class SubEnv(MujocoAttributes):
         self._vector_env, self._index = vector_env, index
 
     @property
-    def _twin(self):  # type: ignore[override]
-        return self._vector_env._twin
+    def _gymnasium_env(self):  # type: ignore[override]
+        return self._vector_env._gymnasium_env
 
     @property
     def render_mode(self) -> str | None:  # type: ignore[override]

@@ -16,11 +16,11 @@ from mjx_walk.envs.state import check_action_shape
 from mjx_walk.interop.gymnasium_info import add_flags, add_info
 from mjx_walk.interop.gymnasium_programs import make_programs, refuse_fork
 from mjx_walk.interop.gymnasium_sub_env import SubEnv
-from mjx_walk.interop.mujoco_attributes import RENDER_MODES, make_twin, split_keywords
+from mjx_walk.interop.mujoco_attributes import RENDER_MODES, make_gymnasium_env, split_keywords
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.value_types import type_problem
 
-_NOT_PICKLED = ("_twin", "_snapshot", "_init", "_programs", "envs")
+_NOT_PICKLED = ("_gymnasium_env", "_snapshot", "_init", "_programs", "envs")
 
 
 class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
@@ -71,19 +71,19 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         self._is_over = np.zeros(num_envs, np.bool_)
         self._build()
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        fps = round(1.0 / self._twin.dt)
-        self.metadata = self._twin.metadata | {"render_fps": fps, "autoreset_mode": self.autoreset_mode}
-        self.render_mode = self._twin.render_mode
-        self.single_observation_space = self._twin.observation_space
-        self.single_action_space = self._twin.action_space
+        fps = round(1.0 / self._gymnasium_env.dt)
+        self.metadata = self._gymnasium_env.metadata | {"render_fps": fps, "autoreset_mode": self.autoreset_mode}
+        self.render_mode = self._gymnasium_env.render_mode
+        self.single_observation_space = self._gymnasium_env.observation_space
+        self.single_action_space = self._gymnasium_env.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def _build(self) -> None:
         self._programs = make_programs(self._options, self._physics)
-        self._twin = make_twin(self._options, self._rendering)
-        self._snapshot = ModelSnapshot(self._twin.model)
-        self._init = {name: getattr(self._twin, name).copy() for name in ("init_qpos", "init_qvel")}
+        self._gymnasium_env = make_gymnasium_env(self._options, self._rendering)
+        self._snapshot = ModelSnapshot(self._gymnasium_env.model)
+        self._init = {name: getattr(self._gymnasium_env, name).copy() for name in ("init_qpos", "init_qvel")}
         self.envs = [SubEnv(self, i) for i in range(self.num_envs)]
 
     @property
@@ -130,7 +130,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         self._refuse_changes()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        check_action_shape(actions, (self.num_envs, self._twin.model.nu))
+        check_action_shape(actions, (self.num_envs, self._gymnasium_env.model.nu))
         mode, was_over = self.autoreset_mode, self._is_over
         if mode == AutoresetMode.DISABLED:
             assert not was_over.any(), f"reset the finished environments first: {np.flatnonzero(was_over)}"
@@ -202,12 +202,12 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the OpenGL contexts."""
-        self.envs[0]._close_twin()
+        self.envs[0]._close_gymnasium_env()
 
     def _refuse_changes(self) -> None:
         self._snapshot.refuse_changes()
         for name, value in self._init.items():
-            if not np.array_equal(getattr(self._twin, name), value):
+            if not np.array_equal(getattr(self._gymnasium_env, name), value):
                 raise UserError(
                     f"resets on the device ignore your change to {name}; use vectorization_mode='sync', whose resets "
                     "read it"

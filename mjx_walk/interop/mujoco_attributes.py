@@ -1,6 +1,6 @@
 """What code for Gymnasium's MuJoCo environments reads of them: the model, times, state and frames.
 
-Each environment holds the real one, its twin. The twin draws resets and renders, and is never stepped.
+Each environment holds one of Gymnasium, which draws resets and renders, and is never stepped.
 """
 
 import inspect
@@ -52,7 +52,7 @@ def split_keywords(keywords: dict[str, Any]) -> tuple[dict[str, Any], dict[str, 
     return {name: value for name, value in keywords.items() if name not in rendering}, rendering
 
 
-def make_twin(options: TaskOptions, rendering: dict[str, Any]) -> MujocoEnv:
+def make_gymnasium_env(options: TaskOptions, rendering: dict[str, Any]) -> MujocoEnv:
     """Gymnasium's own environment, without wrappers.
 
     Args:
@@ -77,7 +77,7 @@ class MujocoAttributes:
     Other changes are refused.
     """
 
-    _twin: MujocoEnv
+    _gymnasium_env: MujocoEnv
     render_mode: str | None
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -86,14 +86,14 @@ class MujocoAttributes:
         Raises:
             UserError: Gymnasium's environment reads the attribute, and this one does not.
         """
-        twin = getattr(self, "_twin", None)  # None while the environment is built
-        is_read = twin is not None and (name in vars(twin) or hasattr(type(twin), name))
+        gymnasium_env = getattr(self, "_gymnasium_env", None)  # None while the environment is built
+        is_read = gymnasium_env is not None and (name in vars(gymnasium_env) or hasattr(type(gymnasium_env), name))
         if is_read and name not in _SETTABLE and not hasattr(gymnasium.Env, name):
             instead = {"model": "; use xml_file=PATH instead", "data": "; use set_state instead"}
-            if callable(getattr(type(twin), name, None)):
+            if callable(getattr(type(gymnasium_env), name, None)):
                 instead[name] = "; write a task of your own instead"
             keyword = name.removeprefix("_")
-            if keyword in (*inspect.signature(type(twin)).parameters, *RENDER_KEYWORDS):
+            if keyword in (*inspect.signature(type(gymnasium_env)).parameters, *RENDER_KEYWORDS):
                 instead[name] = f"; give {keyword}=… to gymnasium.make instead"
             raise UserError(f"the environment ignores your value of {name}{instead.get(name, '')}")
         super().__setattr__(name, value)
@@ -108,55 +108,55 @@ class MujocoAttributes:
     @property
     def model(self) -> mujoco.MjModel:
         """A copy of the MuJoCo model, from which frames are rendered. Changes of its physics are refused."""
-        return self._twin.model
+        return self._gymnasium_env.model
 
     @property
     def dt(self) -> float:
         """Duration of a step, s."""
-        return self._twin.dt
+        return self._gymnasium_env.dt
 
     @property
     def frame_skip(self) -> int:
-        return self._twin.frame_skip
+        return self._gymnasium_env.frame_skip
 
     @property
     def init_qpos(self) -> np.ndarray:
         """`[nq] f64`, m and rad: the pose to which resets add noise."""
-        return self._twin.init_qpos
+        return self._gymnasium_env.init_qpos
 
     @init_qpos.setter
     def init_qpos(self, value: np.ndarray) -> None:
-        self._twin.init_qpos = value
+        self._gymnasium_env.init_qpos = value
 
     @property
     def init_qvel(self) -> np.ndarray:
         """`[nv] f64`, m/s and rad/s."""
-        return self._twin.init_qvel
+        return self._gymnasium_env.init_qvel
 
     @init_qvel.setter
     def init_qvel(self, value: np.ndarray) -> None:
-        self._twin.init_qvel = value
+        self._gymnasium_env.init_qvel = value
 
     @property
     def observation_structure(self) -> dict[str, int]:
         """Sizes of the observation's parts, of the tasks for which Gymnasium defines them."""
-        return self._twin.observation_structure  # type: ignore[attr-defined]
+        return self._gymnasium_env.observation_structure  # type: ignore[attr-defined]
 
     @property
     def width(self) -> int:
-        return self._twin.width
+        return self._gymnasium_env.width
 
     @property
     def height(self) -> int:
-        return self._twin.height
+        return self._gymnasium_env.height
 
     @property
     def camera_id(self) -> int | None:
-        return self._twin.camera_id
+        return self._gymnasium_env.camera_id
 
     @property
     def camera_name(self) -> str | None:
-        return self._twin.camera_name
+        return self._gymnasium_env.camera_name
 
     def state_vector(self) -> np.ndarray:
         """Position and velocity, `[nq + nv] f64`."""
@@ -170,14 +170,14 @@ class MujocoAttributes:
 
     def get_body_com(self, body_name: str) -> np.ndarray:
         """Position of a body's frame, `[3] f64`, m."""
-        self._show_in_twin()
-        return self._twin.get_body_com(body_name).copy()
+        self._show_state()
+        return self._gymnasium_env.get_body_com(body_name).copy()
 
     @property
     def mujoco_renderer(self) -> MujocoRenderer:
         """Gymnasium's renderer, which shows the present state."""
-        self._show_in_twin()
-        return self._twin.mujoco_renderer
+        self._show_state()
+        return self._gymnasium_env.mujoco_renderer
 
     def render(self) -> Any:
         """A frame in the environment's `render_mode`, as Gymnasium gives it: `[height, width, 3] u8` for `rgb_array`.
@@ -194,19 +194,19 @@ class MujocoAttributes:
             renderer.viewer.make_context_current()  # Gymnasium leaves the context of another environment current
         return renderer.render(self.render_mode)
 
-    def _close_twin(self) -> None:
+    def _close_gymnasium_env(self) -> None:
         """Free the OpenGL objects and close the window.
 
         Gymnasium leaves the objects to the garbage collector, which deletes those of another context instead.
         """
-        viewer = self._twin.mujoco_renderer.viewer
+        viewer = self._gymnasium_env.mujoco_renderer.viewer
         if isinstance(viewer, OffScreenViewer):
             viewer.make_context_current()
             viewer.con.free()
-        self._twin.close()
+        self._gymnasium_env.close()
 
-    def _show_in_twin(self) -> None:
-        self._twin.set_state(*self._position_and_velocity())
+    def _show_state(self) -> None:
+        self._gymnasium_env.set_state(*self._position_and_velocity())
 
     def _position_and_velocity(self) -> tuple[np.ndarray, np.ndarray]:
         state = self._read_state()

@@ -29,25 +29,25 @@ _LOG_ROWS, _LOG_CHECKSUM = "log_rows", "log_crc32"
 class MetricsWriter:
     """Appends rows to `metrics.jsonl` and to TensorBoard's event file."""
 
-    def __init__(self, run_dir: Path, resume_steps: int | None = None, mark: Mapping[str, Any] | None = None):
+    def __init__(self, run_dir: Path, resume_steps: int | None = None, position: Mapping[str, Any] | None = None):
         """
         Args:
             run_dir: the run folder.
             resume_steps: environment steps at which the run resumes. Later rows of the interrupted run are dropped.
-            mark: `mark` when the checkpoint was saved. A warning says if the rows up to there are others now.
+            position: `position` when the checkpoint was saved. A warning says if the rows up to there are others now.
         """
         self._run_dir = run_dir
         self._path = run_dir / "metrics.jsonl"
         self._num_rows, self._checksum = 0, 0
         if resume_steps is not None:
-            self._drop_later_rows(resume_steps, mark or {})
+            self._drop_later_rows(resume_steps, position or {})
         self._folder = os.stat(run_dir)
         self._file = Appender(self._path)
         self._events = EventFile(run_dir, resume_steps)
 
     @property
-    def mark(self) -> dict[str, int]:
-        """Number and checksum of the rows so far, as facts of a checkpoint."""
+    def position(self) -> dict[str, int]:
+        """Number and checksum of the rows so far, as metadata of a checkpoint."""
         return {_LOG_ROWS: self._num_rows, _LOG_CHECKSUM: self._checksum}
 
     def write(self, row: Row) -> None:
@@ -77,18 +77,18 @@ class MetricsWriter:
         self._num_rows += 1
         self._checksum = zlib.crc32(line, self._checksum)
 
-    def _drop_later_rows(self, resume_steps: int, mark: Mapping[str, Any]) -> None:
+    def _drop_later_rows(self, resume_steps: int, position: Mapping[str, Any]) -> None:
         lines = [_as_line(row) for row in read_rows(self._path) if row["env_steps"] <= resume_steps]
         for line in lines:
             self._count(line)
-        expected = mark.get(_LOG_ROWS, len(lines))
+        expected = position.get(_LOG_ROWS, len(lines))
         if len(lines) < expected:
             warnings.warn(
                 f"{self._path} has lost {expected - len(lines)} of {expected} rows up to step {resume_steps:,}; the "
                 "training continues without them",
                 stacklevel=4,
             )
-        elif mark.get(_LOG_CHECKSUM, self._checksum) != self._checksum:
+        elif position.get(_LOG_CHECKSUM, self._checksum) != self._checksum:
             warnings.warn(f"{self._path} was changed after the run wrote it, up to step {resume_steps:,}", stacklevel=4)
         with replacing(self._path) as new:
             new.write_bytes(b"".join(lines))

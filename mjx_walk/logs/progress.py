@@ -15,7 +15,7 @@ from mjx_walk.utils.text import duration, format_score
 
 __all__ = ["Progress", "ScoringProgress"]
 
-_LOG = logging.getLogger("mjx_walk.progress")
+_LOGGER = logging.getLogger("mjx_walk.progress")
 _SECONDS_BETWEEN_LINES = 10.0
 """Interval of the log messages."""
 _BAR = "{desc}{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}{speed}{postfix}"
@@ -68,7 +68,7 @@ def _make_bar(stage: str, total: int, done: int, is_shown: bool) -> _Bar:
 
 def _is_terminal() -> bool:
     """Whether progress is shown, and as a bar."""
-    return sys.stderr.isatty() and _LOG.isEnabledFor(logging.INFO)
+    return sys.stderr.isatty() and _LOGGER.isEnabledFor(logging.INFO)
 
 
 class Progress:
@@ -90,7 +90,7 @@ class Progress:
         self._is_terminal = is_shown and _is_terminal()
         self._bar = _make_bar("compiling", total_steps, done_steps, self._is_terminal)
         if is_shown and not self._is_terminal and done_steps < total_steps:
-            _LOG.info("Compiling the training program, which takes seconds to minutes")
+            _LOGGER.info("Compiling the training program, which takes seconds to minutes")
         self._is_compiled = False
         self._is_filling = False
         self._steps = done_steps
@@ -109,7 +109,7 @@ class Progress:
             self._bar.has_time_left = not self._is_filling  # learning is slower
         self.show_stage("filling the replay" if self._is_filling else "training")
         if self._is_filling and not was_filling and not self._is_terminal:
-            _LOG.info("Filling the replay with random actions, before learning starts")
+            _LOGGER.info("Filling the replay with random actions, before learning starts")
         self._evaluated = row.get("eval/return", self._evaluated)
         if self._is_terminal:
             self._bar.set_postfix(self._scores(row), refresh=False)
@@ -134,7 +134,7 @@ class Progress:
         self._bar.refresh()
         self._bar.close()
         if self._is_compiled and self._steps >= self._total:
-            _LOG.info("Evaluating the final policy and drawing the curves")
+            _LOGGER.info("Evaluating the final policy and drawing the curves")
 
     def _scores(self, row: Row) -> dict[str, str]:
         shown = {}
@@ -154,7 +154,7 @@ class Progress:
         parts += [f"{name} {value}" for name, value in self._scores(row).items()]
         if self._is_compiled and steps < self._total and not self._is_filling:
             parts.append(f"{duration((self._total - steps) / max(rate, 1e-9))} left")
-        _LOG.info("%s", "  ".join(parts))
+        _LOGGER.info("%s", "  ".join(parts))
 
 
 class ScoringProgress:
@@ -188,7 +188,7 @@ class ScoringProgress:
             self._last_line = now
             left = duration((self._max_steps - steps) * (now - self._started) / max(steps - self._first, 1))
             episodes = f"{num_over:,} of {self._num_episodes:,} episodes over"
-            _LOG.info("  step %s of %s, %s, at most %s left", f"{steps:,}", f"{self._max_steps:,}", episodes, left)
+            _LOGGER.info("  step %s of %s, %s, at most %s left", f"{steps:,}", f"{self._max_steps:,}", episodes, left)
 
     def close(self) -> None:
         """Remove the bar; the scores follow."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 
 __all__ = ["Interrupt", "Stopped", "as_by_ctrl_c", "exit_code", "ignore_at_exit", "postponed", "undisturbed"]
 
-_PROGRESS = logging.getLogger("mjx_walk.progress")
+_LOGGER = logging.getLogger("mjx_walk.progress")
 _NAMES = ("SIGTERM", "SIGUSR1", "SIGHUP")
 _FROM_OUTSIDE = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 """Signals of schedulers, and of a terminal that closes."""
@@ -38,7 +38,7 @@ class Interrupt:
         if self.signal_name and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.signal_name = signal.Signals(number).name
-        _PROGRESS.info("\n%s: %s", self.signal_name, self._doing)
+        _LOGGER.info("\n%s: %s", self.signal_name, self._doing)
 
 
 class Stopped(KeyboardInterrupt):
@@ -73,7 +73,7 @@ def postponed(doing: str) -> Iterator[None]:
 
     def note(number: int, _) -> None:
         received.append(number)
-        _PROGRESS.info("\n%s: %s", signal.Signals(number).name, doing)
+        _LOGGER.info("\n%s: %s", signal.Signals(number).name, doing)
 
     with _handled_by(note, signal.SIGINT, *_FROM_OUTSIDE):
         yield

@@ -10,6 +10,7 @@ __all__ = ["present_key", "present_overrides", "under_present_names"]
 _RENAMED = {
     "updates_per_chunk": "iterations_per_call",
     "checkpoint.every_chunks": "checkpoint.every_calls",
+    "checkpoint.keep": "checkpoint.max_to_keep",
     "algo.updates_per_step": "algo.grad_updates_per_step",
     "algo.prefill_steps": "algo.learning_starts",
     "algo.measured_steps": "algo.normalizer_warmup_steps_per_env",

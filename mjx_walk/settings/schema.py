@@ -20,7 +20,7 @@ class CheckpointConfig:
 
     every_calls: int = setting(50, at_least=1)
     """Program calls from one checkpoint to the next."""
-    keep: int = setting(3, at_least=1)
+    max_to_keep: int = setting(3, at_least=1)
     """Number of newest checkpoints to keep. Several seeds or devices keep one more until training ends. The best policy
     is kept separately."""
 

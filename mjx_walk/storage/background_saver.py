@@ -15,23 +15,23 @@ class Part(NamedTuple):
 
     path: Path
     tree: Any
-    facts: dict[str, Any]
+    metadata: dict[str, Any]
 
 
 class BackgroundSaver:
     """Writes checkpoints in the background, one at a time. Training waits only for the copy to the host."""
 
-    def __init__(self, folder: Path, keep: int, config: str | None = None, prune_first: bool = False):
+    def __init__(self, folder: Path, max_to_keep: int, config: str | None = None, prune_first: bool = False):
         """
         Args:
             folder: folder of the checkpoints.
-            keep: number of newest checkpoints to keep.
+            max_to_keep: number of newest checkpoints to keep.
             config: text of the configuration, of which each checkpoint holds a copy.
             prune_first: remove old checkpoints and replay buffers before a save rather than after it. Until then, the
                 folder can go back by one checkpoint. `prune` removes the rest at the end.
         """
         self._folder = folder
-        self._keep = keep
+        self._max_to_keep = max_to_keep
         self._config = config
         self._prune_first = prune_first
         self._executor = futures.ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
@@ -57,7 +57,7 @@ class BackgroundSaver:
 
     def prune(self) -> None:
         """Remove old checkpoints and replay buffers."""
-        checkpoint.prune(self._folder, self._keep)
+        checkpoint.prune(self._folder, self._max_to_keep)
 
     def _save(self, parts: Iterable[Part]) -> None:
         steps = [int(part.path.name) for part in parts if part.path.name.isdigit()]

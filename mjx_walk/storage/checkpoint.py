@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_walk.storage.arrays import HostArrays, read_arrays, write_arrays
-from mjx_walk.storage.checkpoint_metadata import FORMAT, read_facts, write_facts
+from mjx_walk.storage.checkpoint_metadata import FORMAT, read_metadata, write_metadata
 from mjx_walk.storage.files import read_bytes, write_text
 from mjx_walk.storage.folders import discard, find_written, remove_unfinished, replacing_folder
 from mjx_walk.storage.saved_yaml import MAX_BYTES
@@ -54,7 +54,7 @@ def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False, co
     Args:
         path: folder to write; an existing one is replaced.
         tree: arrays of any dtype, or the result of `to_host`.
-        meta: JSON-serializable facts to store with the arrays; version and checksums are added.
+        meta: JSON-serializable metadata to store with the arrays; version and checksums are added.
         as_numpy: write one compressed NumPy file instead of Orbax's folder.
         config: text of the configuration, of which the folder gets a copy.
 
@@ -72,7 +72,7 @@ def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False, co
         if config is not None:
             write_text(unfinished / _CONFIG, config)
             meta[_CONFIG_CHECKSUM] = zlib.crc32(config.encode())
-        write_facts(unfinished / _META, meta)
+        write_metadata(unfinished / _META, meta)
 
 
 def find(path: Path) -> Path | None:
@@ -84,7 +84,7 @@ def config_copy(path: Path) -> Path | None:
     """The copy of the configuration that a checkpoint holds; None in checkpoints of earlier versions.
 
     Raises:
-        ValueError: the copy or the facts are damaged.
+        ValueError: the copy or the metadata are damaged.
     """
     checksum = read_meta(path).get(_CONFIG_CHECKSUM)
     if checksum is None:
@@ -109,8 +109,8 @@ def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
         like: pytree of arrays or `ShapeDtypeStruct`s with the same structure.
 
     Returns:
-        The tree, on the default device, and its facts. If `prune` has removed the replay buffer, the tree has an empty
-        one, and a warning says so.
+        The tree, on the default device, and its metadata. If `prune` has removed the replay buffer, the tree has an
+        empty one, and a warning says so.
 
     Raises:
         UserError: an incompatible version wrote the checkpoint, or its leaves have other shapes.
@@ -161,7 +161,7 @@ def read_meta(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: the folder is damaged, or a fact is not what it should be.
     """
-    return read_facts(path / _META)
+    return read_metadata(path / _META)
 
 
 def list_steps(folder: Path) -> list[Path]:
@@ -222,7 +222,7 @@ def restore_newest(
 def _check_steps(path: Path, meta: dict[str, Any]) -> None:
     """Check that a checkpoint is the one that its name says. Facts of earlier versions have no checksum."""
     if meta["env_steps"] != int(path.name):
-        raise ValueError(f"{path} is damaged: its facts are of step {meta['env_steps']}")
+        raise ValueError(f"{path} is damaged: its metadata are of step {meta['env_steps']}")
 
 
 def discard_from(folder: Path, env_steps: int) -> None:
@@ -232,14 +232,14 @@ def discard_from(folder: Path, env_steps: int) -> None:
             discard(path)
 
 
-def prune(folder: Path, keep: int) -> None:
+def prune(folder: Path, max_to_keep: int) -> None:
     """Remove old checkpoints, old replay buffers and unfinished saves.
 
     Args:
         folder: folder of the checkpoints.
-        keep: number of newest checkpoints to keep. Only the newest keeps its replay buffer.
+        max_to_keep: number of newest checkpoints to keep. Only the newest keeps its replay buffer.
     """
-    for path in list_steps(folder)[:-keep]:
+    for path in list_steps(folder)[:-max_to_keep]:
         discard(path)
     for path in list_steps(folder)[:-1]:
         if (path / _REPLAY).exists():

@@ -1,4 +1,4 @@
-"""The facts stored with a checkpoint, checked before they are used: the file may come from anywhere."""
+"""The metadata stored with a checkpoint, checked before they are used: the file may come from anywhere."""
 
 import json
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from mjx_walk.storage.files import write_text
 from mjx_walk.utils.errors import failed_read
 from mjx_walk.utils.versions import __version__
 
-__all__ = ["FORMAT", "read_facts", "write_facts"]
+__all__ = ["FORMAT", "read_metadata", "write_metadata"]
 
 FORMAT = 1
 """Version of the checkpoint format. Increment it when a change makes older checkpoints unreadable."""
@@ -20,38 +20,38 @@ _MAX_NUMBER = 1e300
 _REQUIRED = ("env_steps", "crc32")
 
 
-def write_facts(path: Path, facts: dict[str, Any]) -> None:
+def write_metadata(path: Path, metadata: dict[str, Any]) -> None:
     """Write a `meta.json`, with the versions and a checksum."""
-    facts = {"format": FORMAT, "mjx_walk": __version__} | facts
-    write_text(path, json.dumps(with_checksum(facts)))
+    metadata = {"format": FORMAT, "mjx_walk": __version__} | metadata
+    write_text(path, json.dumps(with_checksum(metadata)))
 
 
-def read_facts(path: Path) -> dict[str, Any]:
+def read_metadata(path: Path) -> dict[str, Any]:
     """Read a `meta.json`. Facts that this version does not know are not checked.
 
     Returns:
-        The facts. Those of another format than `FORMAT` are returned without a look at the checksum.
+        The metadata. Those of another format than `FORMAT` are returned without a look at the checksum.
 
     Raises:
         UnreadableError: the file cannot be read now.
         ValueError: the file is missing, a fact is not what it should be, or the checksum does not match.
     """
     try:
-        facts = read_json(path, _MAX_BYTES)
+        metadata = read_json(path, _MAX_BYTES)
     except OSError as error:
         raise failed_read(path.parent, error) from error
     except ValueError as error:
         raise ValueError(f"{path.parent} is damaged: {path.name}: {error}") from error
-    if not isinstance(facts, dict):
-        raise ValueError(f"{path} should be a JSON object, found {_shown(facts)}")
+    if not isinstance(metadata, dict):
+        raise ValueError(f"{path} should be a JSON object, found {_shown(metadata)}")
     for name, (is_valid, valid) in _FACTS.items():
-        if name in facts and not is_valid(facts[name]):
-            raise ValueError(f"{path}: {name} should be {valid}, found {_shown(facts[name])}")
-        if name in _REQUIRED and name not in facts:
+        if name in metadata and not is_valid(metadata[name]):
+            raise ValueError(f"{path}: {name} should be {valid}, found {_shown(metadata[name])}")
+        if name in _REQUIRED and name not in metadata:
             raise ValueError(f"{path}: {name} should be {valid}, found nothing")
-    if not take_checksum(facts) and facts.get("format") == FORMAT:
+    if not take_checksum(metadata) and metadata.get("format") == FORMAT:
         raise ValueError(f"{path.parent} is damaged: {path.name} does not match its checksum")
-    return facts
+    return metadata
 
 
 def _is_count(value: Any, at_least: int = 0) -> bool:

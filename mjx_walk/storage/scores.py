@@ -56,11 +56,11 @@ class Scores:
             f"mean length {self.lengths.mean():,.1f}, lowest {self.returns.min():,.1f}"
         )
 
-    def block(self, **facts: Any) -> dict[str, Any]:
+    def block(self, **metadata: Any) -> dict[str, Any]:
         """All episodes and their mean and deviation, for `write_scores`.
 
         Args:
-            facts: JSON-serializable facts about the policy, such as `env_steps`.
+            metadata: JSON-serializable metadata about the policy, such as `env_steps`.
         """
         return {
             "mean": self.mean,
@@ -68,7 +68,7 @@ class Scores:
             "returns": self.returns.tolist(),
             "lengths": self.lengths.tolist(),
             "seeds": self.seeds,
-            **facts,
+            **metadata,
         }
 
 
@@ -80,7 +80,7 @@ class ScoreFile:
     """Gymnasium's id of the environment."""
     blocks: dict[str, dict[str, Any]]
     """`Scores.block` of each scored policy, by its name: `final`, `best`, or `better` in a file with one block."""
-    facts: dict[str, Any]
+    metadata: dict[str, Any]
     """Everything else, such as `versions`, `wall_seconds` and `command`."""
 
     def block(self, *names: str) -> dict[str, Any] | None:
@@ -88,17 +88,17 @@ class ScoreFile:
         return next((self.blocks[name] for name in names if name in self.blocks), None)
 
 
-def write_scores(path: Path, env: str, blocks: dict[str, dict[str, Any]], facts: Mapping[str, Any]) -> None:
+def write_scores(path: Path, env: str, blocks: dict[str, dict[str, Any]], metadata: Mapping[str, Any]) -> None:
     """Write scores as JSON, with the versions of the packages and a checksum.
 
     Args:
         path: file to replace.
         env: Gymnasium's id of the environment.
         blocks: `Scores.block` of each scored policy, by its name.
-        facts: JSON-serializable facts about the run. They do not replace the scores, whatever their names are.
+        metadata: JSON-serializable metadata about the run. They do not replace the scores, whatever their names are.
     """
     scores = {"env": env, **blocks}
-    others = {name: fact for name, fact in facts.items() if name not in scores}
+    others = {name: fact for name, fact in metadata.items() if name not in scores}
     content = scores | others | {"versions": package_versions()}
     write_text(path, json.dumps(with_checksum(content), indent=1))
 

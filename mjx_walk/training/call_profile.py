@@ -8,7 +8,7 @@ import jax
 
 from mjx_walk.utils.errors import first_line
 
-_log = logging.getLogger(__name__)
+_LOGGER = logging.getLogger(__name__)
 
 CALLS_BEFORE = 2
 """The first call compiles the training's programs, and the programs that read its results compile after it."""
@@ -50,7 +50,7 @@ class CallProfile:
             jax.profiler.start_trace(self._folder, profiler_options=options)
             self._is_recording = True
         except RuntimeError as error:  # the user's own program records already
-            _log.warning(f"cannot record calls: {first_line(error)}")
+            _LOGGER.warning(f"cannot record calls: {first_line(error)}")
 
     def _stop(self) -> None:
         if not self._is_recording:
@@ -61,4 +61,4 @@ class CallProfile:
                 raise OSError("its run folder was removed")  # the profiler would make it anew
             jax.profiler.stop_trace()
         except (OSError, RuntimeError) as error:
-            _log.warning(f"cannot write the recording of calls to {self._folder}: {first_line(error)}")
+            _LOGGER.warning(f"cannot write the recording of calls to {self._folder}: {first_line(error)}")

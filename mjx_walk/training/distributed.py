@@ -23,7 +23,7 @@ from mjx_walk.algos import Algorithm, TrainState
 from mjx_walk.training.programs import Program, Step, make_axis_program, make_init
 from mjx_walk.utils import collectives
 from mjx_walk.utils.collectives import DEVICES
-from mjx_walk.utils.types import Metric, Metrics, Reduction, map_marked
+from mjx_walk.utils.types import Metric, Metrics, Reduction, map_leaves_with
 
 _PATH_BYTES = 4096
 _TIMEOUT = 3600
@@ -112,7 +112,7 @@ def make_devices_program(algorithm: Algorithm, processes: Processes, iterations_
 def _init_on_device(algorithm: Algorithm, process_index: int, key: jax.Array) -> TrainState:
     """Initial state of a device. Leaves that are per device start from the device's own key."""
     shared, own = algorithm.init(key), algorithm.init(jax.random.fold_in(key, process_index))
-    state = map_marked(lambda _, leaf: leaf, "per_device", shared, own)
+    state = map_leaves_with(lambda _, leaf: leaf, "per_device", shared, own)
     # The devices act with the shared policy, so that is the one that their first evaluation scores.
     policies = {"policy_params": algorithm.policy_params(shared), "best_policy_params": algorithm.policy_params(shared)}
     return _expand(state.replace(evaluation=state.evaluation.replace(**policies)))

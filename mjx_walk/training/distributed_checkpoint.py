@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from mjx_walk.algos import TrainState
 from mjx_walk.storage import checkpoint
 from mjx_walk.training.distributed import Processes
-from mjx_walk.utils.types import map_marked
+from mjx_walk.utils.types import map_leaves_with
 
 NUM_DEVICES = "num_devices"
-"""Key of a checkpoint's facts: the number of devices that saved it."""
+"""Key of a checkpoint's metadata: the number of devices that saved it."""
 SEEDS_TOGETHER = "seeds_together"
-"""Key of a checkpoint's facts: the number of runs that trained in one program."""
+"""Key of a checkpoint's metadata: the number of runs that trained in one program."""
 
 
 def device_folder(checkpoints: Path, process_index: int) -> Path:
@@ -42,24 +42,24 @@ def restore_newest(
     index, count = processes.process_index, processes.process_count
 
     def part(path: Path) -> Path:
-        facts = checkpoint.read_meta(path)
-        if "wall_seconds" not in facts:
-            raise ValueError(f"{path} is damaged: its facts lack wall_seconds")
-        former_count = facts.get(NUM_DEVICES, 1)
+        metadata = checkpoint.read_meta(path)
+        if "wall_seconds" not in metadata:
+            raise ValueError(f"{path} is damaged: its metadata lack wall_seconds")
+        former_count = metadata.get(NUM_DEVICES, 1)
         return device_folder(checkpoints, index % former_count) / path.name
 
     def agree(is_complete: bool) -> bool:
         return all(processes.all_gather(is_complete))
 
-    state, facts = checkpoint.restore_newest(checkpoints, like, part, agree, at_most)
-    former_count = facts.get(NUM_DEVICES, 1)
+    state, metadata = checkpoint.restore_newest(checkpoints, like, part, agree, at_most)
+    former_count = metadata.get(NUM_DEVICES, 1)
     if index >= former_count:
-        state = map_marked(lambda key: jax.random.fold_in(key, index), "random_key", state)
+        state = map_leaves_with(lambda key: jax.random.fold_in(key, index), "random_key", state)
     if former_count != count:
         state = _rescale_counts(state, former_count, count)
-    return state, facts
+    return state, metadata
 
 
 def _rescale_counts(state: TrainState, former_count: int, count: int) -> TrainState:
     """Iteration counts for another number of devices: the more devices, the fewer iterations for the same steps."""
-    return map_marked(lambda number: jnp.int32(number * former_count // count), "iteration_count", state)
+    return map_leaves_with(lambda number: jnp.int32(number * former_count // count), "iteration_count", state)

@@ -14,7 +14,7 @@ from mjx_walk.machine.signals import Interrupt, exit_code
 from mjx_walk.machine.subprocesses import python
 from mjx_walk.utils.errors import UserError
 
-_log = logging.getLogger(__name__)
+_LOGGER = logging.getLogger(__name__)
 
 _PATIENCE = 20.0
 """Seconds that the other processes have to exit after one has failed."""
@@ -62,9 +62,9 @@ def run(arguments: list[str], size: int) -> int:
             return exit_code(interrupt.signal_name)
         if rank:
             output = _log_file(Path(logs), rank).read_text(encoding="utf-8", errors="replace")
-            _log.error(f"the output of device {rank} ends with:\n{output[-2000:]}")
+            _LOGGER.error(f"the output of device {rank} ends with:\n{output[-2000:]}")
         if code != 2:  # with code 2 the process has printed its own error
-            _log.error(
+            _LOGGER.error(
                 f"the process of device {rank} failed with exit code {code}; "
                 "the last saved checkpoint is complete; add resume=true to resume from it"
             )

@@ -24,7 +24,7 @@ from mjx_walk.training.distributed_checkpoint import NUM_DEVICES, SEEDS_TOGETHER
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.film import Filmer
 
-_log = logging.getLogger(__name__)
+_LOGGER = logging.getLogger(__name__)
 
 
 class Recorder:
@@ -63,10 +63,10 @@ class Recorder:
         # A kill may leave some of several folders one checkpoint ahead. They go back to the one before.
         is_saved_with_others = seeds_together > 1 or processes.process_count > 1
         self._saver = BackgroundSaver(
-            self._checkpoints, config.checkpoint.keep, as_yaml(config), prune_first=is_saved_with_others
+            self._checkpoints, config.checkpoint.max_to_keep, as_yaml(config), prune_first=is_saved_with_others
         )
         self._best_iteration = -1
-        self._restored_facts: Mapping[str, Any] = {}
+        self._restored_metadata: Mapping[str, Any] = {}
         self._writer: MetricsWriter | None = None
         self._wandb: WandbLog | None = None
         self._filmer = Filmer(config, folder) if config.evaluation.films else None
@@ -83,9 +83,9 @@ class Recorder:
             like: TrainState of shapes and dtypes.
             at_most: environment steps that it may have at most.
         """
-        state, facts = restore_newest(self._folder.checkpoints, like, self._processes, at_most)
-        self._restored_facts = facts
-        return state, facts
+        state, metadata = restore_newest(self._folder.checkpoints, like, self._processes, at_most)
+        self._restored_metadata = metadata
+        return state, metadata
 
     def begin(self, env_steps: int, will_train: bool) -> None:
         """Open the logs. Save the configuration of a resumed run.
@@ -101,7 +101,7 @@ class Recorder:
                 save_config(self.config, self._folder.config)
             save_inputs(self._inputs, self._folder.inputs)
             resume_steps = env_steps if self.config.resume else None
-            self._writer = MetricsWriter(self._folder.path, resume_steps, self._restored_facts)
+            self._writer = MetricsWriter(self._folder.path, resume_steps, self._restored_metadata)
             self._wandb = WandbLog(self.config, self._folder) if self.config.wandb_project else None
             if will_train:
                 self._folder.gymnasium_scores.unlink(missing_ok=True)
@@ -125,15 +125,15 @@ class Recorder:
 
         Saving a state with a replay buffer may take long.
         """
-        facts = {
+        metadata = {
             "env_steps": env_steps,
             "wall_seconds": wall_seconds,
             NUM_DEVICES: self._processes.process_count,
             SEEDS_TOGETHER: self._seeds_together,
         }
         if self._writer:
-            facts |= self._writer.mark
-        parts = [Part(checkpoint.step_path(self._checkpoints, env_steps), state, facts)]
+            metadata |= self._writer.position
+        parts = [Part(checkpoint.step_path(self._checkpoints, env_steps), state, metadata)]
         if self._is_main_process:
             final = (self._algorithm.policy_params(state), {"env_steps": env_steps})
             parts.insert(0, Part(self._folder.policy(FINAL), *final))
@@ -164,17 +164,17 @@ class Recorder:
         try:
             plot_run(self._folder)
         except (OSError, UserError) as error:
-            _log.warning(f"cannot draw the curves of {self._folder.path}: {error}; draw them with mjx_walk.plots")
+            _LOGGER.warning(f"cannot draw the curves of {self._folder.path}: {error}; draw them with mjx_walk.plots")
         final: Any = self._algorithm.policy_params(state)
-        facts: dict[str, Any] = {"env_steps": env_steps}
+        metadata: dict[str, Any] = {"env_steps": env_steps}
         best = best_policy(state, self._steps_per_iteration)
         if evaluate:
-            facts |= {"eval_return": evaluate(final)}
-            if not best or facts["eval_return"] > best[1]["eval_return"]:
-                best = (final, facts)
+            metadata |= {"eval_return": evaluate(final)}
+            if not best or metadata["eval_return"] > best[1]["eval_return"]:
+                best = (final, metadata)
                 with self._writing():
                     self._saver.save(Part(self._folder.policy(BEST), *best))
-        self._policies = {FINAL: (final, facts)} | ({BEST: best} if best else {})
+        self._policies = {FINAL: (final, metadata)} | ({BEST: best} if best else {})
 
     def score(self, wall_seconds: float) -> dict[str, tuple[Scores, int]]:
         """Score the final and the best policy in the real Gymnasium, and write `eval_gymnasium.json`.
@@ -190,13 +190,13 @@ class Recorder:
         acting = make_acting_algorithm(self._task, self.config)
         scored: dict[str, tuple[Scores, int]] = {}
         blocks = {}
-        for name, (params, facts) in self._policies.items():
-            if scored and facts is self._policies[FINAL][1]:  # the final policy is also the best
+        for name, (params, metadata) in self._policies.items():
+            if scored and metadata is self._policies[FINAL][1]:  # the final policy is also the best
                 scores = scored[FINAL][0]
             else:
                 scores = score_in_gymnasium(self._task, deterministic_act(acting, params), num_episodes)
-            scored[name] = (scores, facts["env_steps"])
-            blocks[name] = scores.block(**facts)
+            scored[name] = (scores, metadata["env_steps"])
+            blocks[name] = scores.block(**metadata)
         with self._writing():
             write_scores(self._folder.gymnasium_scores, self._task.gymnasium_id, blocks, {"wall_seconds": wall_seconds})
         return scored

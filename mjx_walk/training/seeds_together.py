@@ -36,7 +36,7 @@ def have_saved(folders: list[RunFolder]) -> bool:
 
 
 def restore_together(recorders: list[Recorder], like: TrainState) -> list[tuple[TrainState, dict[str, Any]]]:
-    """The newest saved state and its facts of each run, all at the same step.
+    """The newest saved state and its metadata of each run, all at the same step.
 
     Args:
         recorders: of the runs.
@@ -46,7 +46,7 @@ def restore_together(recorders: list[Recorder], like: TrainState) -> list[tuple[
         UserError: a run has no usable checkpoint, or some have continued alone.
     """
     restored = [recorder.restore(like) for recorder in recorders]
-    steps = [facts["env_steps"] for _, facts in restored]
+    steps = [metadata["env_steps"] for _, metadata in restored]
     first = min(steps)
     ahead = [i for i, step in enumerate(steps) if step > first]
     for i in ahead:

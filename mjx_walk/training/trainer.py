@@ -38,7 +38,7 @@ from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import Metrics
 
-_log = logging.getLogger(__name__)
+_LOGGER = logging.getLogger(__name__)
 
 _CLOSING_EVALUATION = 2**31 - 1
 """Folded into a run's seed, so that the evaluation at the end has its own episodes."""
@@ -155,9 +155,9 @@ class Trainer:
         if not self._processes.is_main_process:
             return
         if call >= self.num_calls:
-            _log.info(f"The run has already completed its {steps:,} steps; to continue, give a larger total_steps")
+            _LOGGER.info(f"The run has already completed its {steps:,} steps; to continue, give a larger total_steps")
         elif steps != total:
-            _log.info(f"total_steps={total:,} is rounded up to {steps:,}: a call has {self.steps_per_call:,} steps")
+            _LOGGER.info(f"total_steps={total:,} is rounded up to {steps:,}: a call has {self.steps_per_call:,} steps")
 
     def score(self) -> None:
         """Score every run in the real Gymnasium with `Recorder.score`, and log the last lines of the training.
@@ -170,18 +170,18 @@ class Trainer:
         if num_episodes and is_main:
             where = "Gymnasium, on the CPU" if self._task.is_in_gymnasium else f"physics={self._task.engine.name}"
             episodes = "episode" if num_episodes == 1 else "episodes"
-            _log.info("Scoring %d %s of each policy in %s", num_episodes, episodes, where)
+            _LOGGER.info("Scoring %d %s of each policy in %s", num_episodes, episodes, where)
         try:
             for recorder in self.recorders:
                 seed = recorder.config.seed if len(self.recorders) > 1 else None
                 for line in score_lines(recorder.score(seconds), self.num_calls * self.steps_per_call, seed):
-                    _log.info(line)
+                    _LOGGER.info(line)
         finally:
             for recorder in self.recorders:
                 recorder.wait()
         paths = [folder.path for folder in self._folders]
         for line in end_lines(paths, seconds, self._seconds(), bool(num_episodes)) if is_main else ():
-            _log.info(line)
+            _LOGGER.info(line)
 
     def close(self) -> None:
         """Finish the checkpoints that are being written, and close the logs, however training has ended."""
@@ -197,7 +197,7 @@ class Trainer:
                     warnings.warn(f"{folder.path} has no checkpoint; training restarts from step 0", stacklevel=2)
             return None, 0
         restored = restore_together(self.recorders, self._algorithm.state_shapes())
-        self._seconds_before = max(facts["wall_seconds"] for _, facts in restored)
+        self._seconds_before = max(metadata["wall_seconds"] for _, metadata in restored)
         calls = restored[0][1]["env_steps"] // self.steps_per_call
         return self._program.merge([state for state, _ in restored]), calls
 
@@ -256,7 +256,7 @@ class Trainer:
         for metric, warning in physics_warnings(row, self.steps_per_call).items():
             if metric not in self._warned_of:
                 self._warned_of.add(metric)
-                _log.warning(f"{warning}; the metric {metric} has the count")
+                _LOGGER.warning(f"{warning}; the metric {metric} has the count")
 
     def _seconds(self) -> float:
         return self._seconds_before + time.monotonic() - self._started

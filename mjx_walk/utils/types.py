@@ -1,4 +1,4 @@
-"""Types that every part of the trainer exchanges, and the marks on the leaves of its state."""
+"""Types that every part of the trainer exchanges, and the metadata of its state's fields."""
 
 import dataclasses
 import enum
@@ -21,8 +21,8 @@ __all__ = [
     "Reduction",
     "Transition",
     "as_means",
-    "map_marked",
-    "mark_flags",
+    "leaves_with",
+    "map_leaves_with",
 ]
 
 PolicyFn = Callable[[jax.Array, jax.Array], jax.Array]
@@ -78,8 +78,8 @@ ITERATION_COUNT = {"iteration_count": True}
 """A count of iterations, whose environment steps depend on the number of devices."""
 
 
-def mark_flags(tree: Any, mark: str) -> list[bool]:
-    """For each leaf of a pytree, in order: whether its field, or a field around it, has the mark."""
+def leaves_with(tree: Any, key: str) -> list[bool]:
+    """For each leaf of a pytree, in order: whether its field, or a field around it, has metadata of this key."""
     flags: list[bool] = []
     for node in jax.tree.leaves(tree, is_leaf=dataclasses.is_dataclass):
         if not dataclasses.is_dataclass(node):
@@ -88,15 +88,15 @@ def mark_flags(tree: Any, mark: str) -> list[bool]:
         for field in dataclasses.fields(node):
             if field.metadata.get("pytree_node", True):
                 value = getattr(node, field.name)
-                is_marked = field.metadata.get(mark, False)
-                flags += [True] * len(jax.tree.leaves(value)) if is_marked else mark_flags(value, mark)
+                has_key = field.metadata.get(key, False)
+                flags += [True] * len(jax.tree.leaves(value)) if has_key else leaves_with(value, key)
     return flags
 
 
-def map_marked(function: Callable[..., Any], mark: str, tree: Any, *others: Any) -> Any:
-    """Apply a function to the leaves that have a mark, and keep the other leaves of the first tree."""
+def map_leaves_with(function: Callable[..., Any], key: str, tree: Any, *others: Any) -> Any:
+    """Apply a function to the leaves whose field has metadata of this key. Others are those of the first tree."""
     leaves, structure = jax.tree.flatten(tree)
     columns = zip(leaves, *map(jax.tree.leaves, others), strict=True)
-    flags = mark_flags(tree, mark)
+    flags = leaves_with(tree, key)
     new = [function(*column) if flag else column[0] for flag, column in zip(flags, columns, strict=True)]
     return jax.tree.unflatten(structure, new)

@@ -66,9 +66,10 @@ def table() -> str:
     ]
     for name in names():
         scores = read_scores(RunFolder(_FOLDER / name).gymnasium_scores)
-        block, facts = scores.blocks[BEST], scores.facts
-        mean, std, runs_mean = (format_score(x) for x in (block["mean"], block["std"], facts["runs_mean"]))
-        cells = [f"`{PREFIX}{name}`", scores.env, mean, std, str(facts["num_runs"]), runs_mean, f"`{facts['command']}`"]
+        block, metadata = scores.blocks[BEST], scores.metadata
+        mean, std, runs_mean = (format_score(x) for x in (block["mean"], block["std"], metadata["runs_mean"]))
+        num_runs, command = str(metadata["num_runs"]), f"`{metadata['command']}`"
+        cells = [f"`{PREFIX}{name}`", scores.env, mean, std, num_runs, runs_mean, command]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -56,11 +56,11 @@ def main(command_line: list[str]) -> None:
     folder = zoo.empty_folder(arguments.name)
     config = dataclasses.replace(run.config, physics="auto", run_dir=None, resume=False)
     save_config(config, folder.config)
-    checkpoint.save(folder.policy(BEST), run.policy_params, run.policy_facts, as_numpy=True)
+    checkpoint.save(folder.policy(BEST), run.policy_params, run.policy_metadata, as_numpy=True)
     write_scores(
         folder.gymnasium_scores,
         scores.env,
-        {BEST: scores.block(**run.policy_facts)},
+        {BEST: scores.block(**run.policy_metadata)},
         {
             "command": training_command(config),
             "num_runs": arguments.num_runs,

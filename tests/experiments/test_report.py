@@ -52,7 +52,7 @@ def test_a_score_file_of_one_block_counts_as_the_best(tmp_path):
     (tmp_path / "0" / "eval_gymnasium.json").write_text(json.dumps(content | {"env_steps": 5, "wall_seconds": 2.0}))
     (run,) = logged_runs.read_runs(tmp_path)
     assert run.score("final") == {} and run.score("best")["mean"] == 7.0
-    assert run.scores.blocks["better"]["env_steps"] == 5 and run.scores.facts == {"wall_seconds": 2.0}
+    assert run.scores.blocks["better"]["env_steps"] == 5 and run.scores.metadata == {"wall_seconds": 2.0}
 
 
 def test_runs_of_several_environments_are_normalized(tmp_path):

@@ -55,38 +55,38 @@ def test_many_damaged_lines_cost_one_warning(tmp_path):
 
 @pytest.fixture
 def logged(tmp_path):
-    """A log of four rows, and the mark that a checkpoint stores with it."""
+    """A log of four rows, and the position that a checkpoint stores with it."""
     writer = MetricsWriter(tmp_path)
     for step in (1, 2, 3, 4):
         writer.write({"env_steps": step, "wall_seconds": 0.1 + step, "train/loss": float("nan")})
     writer.close()
-    return tmp_path / "metrics.jsonl", writer.mark
+    return tmp_path / "metrics.jsonl", writer.position
 
 
 def test_an_intact_log_resumes_in_silence(logged, recwarn):
-    path, mark = logged
+    path, position = logged
     before = path.read_bytes()
     with path.open("a") as file:
         file.write(line(5) + '{"env')  # after the checkpoint
-    writer = MetricsWriter(path.parent, 4, mark)
-    assert writer.mark == mark and path.read_bytes() == before and not recwarn
+    writer = MetricsWriter(path.parent, 4, position)
+    assert writer.position == position and path.read_bytes() == before and not recwarn
     writer.close()
 
 
 @pytest.mark.parametrize("kept", [[0, 1, 2], [0, 2, 3], [1, 2], []])
 def test_lost_rows_are_noticed(logged, kept):
-    path, mark = logged
+    path, position = logged
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[i] for i in kept))
     with pytest.warns(UserWarning, match=rf"metrics\.jsonl has lost {4 - len(kept)} of 4 rows up to step 4"):
-        MetricsWriter(path.parent, 4, mark).close()
+        MetricsWriter(path.parent, 4, position).close()
 
 
 def test_a_changed_row_is_noticed(logged):
-    path, mark = logged
+    path, position = logged
     path.write_text(path.read_text().replace("2.1", "2.2"))
     with pytest.warns(UserWarning, match=r"metrics\.jsonl was changed after the run wrote it, up to step 4"):
-        MetricsWriter(path.parent, 4, mark).close()
+        MetricsWriter(path.parent, 4, position).close()
 
 
 @pytest.mark.parametrize("is_replaced", [False, True])

@@ -12,7 +12,7 @@ from helpers import flip_a_byte
 from mjx_walk.storage import arrays, checkpoint, checksums
 from mjx_walk.storage.arrays import _as_os_error
 from mjx_walk.storage.background_saver import BackgroundSaver, Part
-from mjx_walk.storage.checkpoint_metadata import read_facts, write_facts
+from mjx_walk.storage.checkpoint_metadata import read_metadata, write_metadata
 from mjx_walk.utils.errors import UserError
 
 TREE = {
@@ -67,7 +67,7 @@ def test_only_the_newest_are_kept(tmp_path):
 
 
 def test_of_folders_saved_together_each_can_go_back_until_all_are_saved(tmp_path):
-    saver = BackgroundSaver(tmp_path, keep=1, prune_first=True)
+    saver = BackgroundSaver(tmp_path, max_to_keep=1, prune_first=True)
     state = {"a": jnp.ones(2), "replay": {"b": jnp.ones(3)}}
     for steps, kept in ((10, [10]), (20, [10, 20]), (20, [10, 20]), (30, [20, 30])):
         saver.save(Part(checkpoint.step_path(tmp_path, steps), state, {"env_steps": steps}))
@@ -126,8 +126,8 @@ def refused_or_equal(path):
 
 
 def test_no_changed_character_of_the_facts_goes_unnoticed(tmp_path):
-    path, facts = checkpoint.step_path(tmp_path, 10), {"env_steps": 10, "wall_seconds": 2.5, "num_devices": 1}
-    checkpoint.save(path, TREE, facts, as_numpy=True)
+    path, metadata = checkpoint.step_path(tmp_path, 10), {"env_steps": 10, "wall_seconds": 2.5, "num_devices": 1}
+    checkpoint.save(path, TREE, metadata, as_numpy=True)
     meta = path / "meta.json"
     text = meta.read_text()
     for i, character in enumerate(text):
@@ -150,22 +150,22 @@ def test_facts_of_an_earlier_version_are_those_of_their_own_step(tmp_path, steps
     if steps == 10:
         assert checkpoint.restore_newest(tmp_path, TREE)[1]["env_steps"] == 10
         return
-    with pytest.warns(UserWarning, match="its facts are of step 11"), pytest.raises(UserError):
+    with pytest.warns(UserWarning, match="its metadata are of step 11"), pytest.raises(UserError):
         checkpoint.restore_newest(tmp_path, TREE)
 
 
-@pytest.mark.parametrize("damage", ["format", "shape", "configuration", "no configuration", "no facts", "no arrays"])
+@pytest.mark.parametrize("damage", ["format", "shape", "configuration", "no configuration", "no metadata", "no arrays"])
 def test_whatever_is_wrong_with_a_checkpoint_the_one_before_is_used(tmp_path, damage):
     for steps in (10, 20):
         tree = TREE | {"a": jnp.zeros(9)} if (damage, steps) == ("shape", 20) else TREE
         checkpoint.save(checkpoint.step_path(tmp_path, steps), tree, {"env_steps": steps}, True, "seed: 0")
     newest = checkpoint.step_path(tmp_path, 20)
     if damage == "format":
-        write_facts(newest / "meta.json", read_facts(newest / "meta.json") | {"format": 9})
+        write_metadata(newest / "meta.json", read_metadata(newest / "meta.json") | {"format": 9})
     elif damage == "configuration":
         (newest / "run_config.yaml").write_text("seed: 1")
-    elif damage in ("no configuration", "no facts"):
-        (newest / {"no configuration": "run_config.yaml", "no facts": "meta.json"}[damage]).unlink()
+    elif damage in ("no configuration", "no metadata"):
+        (newest / {"no configuration": "run_config.yaml", "no metadata": "meta.json"}[damage]).unlink()
     elif damage == "no arrays":
         shutil.rmtree(newest / "arrays")
     with pytest.warns(UserWarning, match=f"{newest}.*; falling back to the previous checkpoint"):

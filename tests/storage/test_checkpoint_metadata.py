@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from mjx_walk.storage import checkpoint
-from mjx_walk.storage.checkpoint_metadata import read_facts, write_facts
+from mjx_walk.storage.checkpoint_metadata import read_metadata, write_metadata
 from mjx_walk.utils.errors import UserError
 
 ARRAYS = {"a": np.arange(3, dtype=np.float32)}
 
 
-def saved(tmp_path, **facts):
+def saved(tmp_path, **metadata):
     path = checkpoint.step_path(tmp_path, 10)
     checkpoint.save(path, ARRAYS, {"env_steps": 10, "wall_seconds": 1.0})
-    write_facts(path / "meta.json", read_facts(path / "meta.json") | facts)
+    write_metadata(path / "meta.json", read_metadata(path / "meta.json") | metadata)
     return path
 
 

@@ -33,8 +33,8 @@ def test_an_old_run_loads_acts_and_resumes(algo, tmp_path):
         train_here(run_dir, "resume=true", "total_steps=32", tiny=[])
     newest = checkpoint.list_steps(run_dir / "checkpoints")[-1]
     like = jax.eval_shape(run.algorithm.init, jax.random.PRNGKey(0))
-    found, facts = checkpoint.restore(newest, like)
-    assert facts["env_steps"] == 32
+    found, metadata = checkpoint.restore(newest, like)
+    assert metadata["env_steps"] == 32
     leaves = {checkpoint.present_name(name): leaf for name, leaf in expected["leaves"].items()}
     named = jax.tree_util.tree_leaves_with_path(found)
     assert len(named) == len(leaves)

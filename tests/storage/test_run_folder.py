@@ -13,7 +13,7 @@ from mjx_walk import api
 from mjx_walk.settings.saved_config import in_short
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.background_saver import BackgroundSaver, Part
-from mjx_walk.storage.checkpoint_metadata import read_facts, write_facts
+from mjx_walk.storage.checkpoint_metadata import read_metadata, write_metadata
 from mjx_walk.storage.run_folder import RunFolder, open_existing
 from mjx_walk.training.folder_checks import prepared
 from mjx_walk.utils.errors import UserError
@@ -95,7 +95,7 @@ def test_without_a_configuration_no_copy_is_read_for_ever(downloaded, name, kind
         if path.is_dir():
             copy, meta = path / "run_config.yaml", path / "meta.json"
             copy.write_text("x")
-            write_facts(meta, read_facts(meta) | {"config_crc32": zlib.crc32(b"x")})
+            write_metadata(meta, read_metadata(meta) | {"config_crc32": zlib.crc32(b"x")})
             (path / name).unlink()
             if kind == "pipe":
                 os.mkfifo(path / name)
@@ -142,7 +142,7 @@ def test_a_save_replaces_a_file_in_place_of_a_checkpoint(tmp_path):
     for name in ("best", f".best.{'0' * 16}.unfinished"):
         (tmp_path / name).write_text("x")
     checkpoint.save(tmp_path / "best", {"a": np.zeros(2)}, {})
-    checkpoint.prune(tmp_path, keep=1)
+    checkpoint.prune(tmp_path, max_to_keep=1)
     assert [path.name for path in tmp_path.iterdir()] == ["best"] and (tmp_path / "best").is_dir()
 
 
@@ -166,7 +166,7 @@ def test_later_checkpoints_do_not_crowd_out_new_ones(tmp_path):
     tree = {"a": 1.0}
     for steps in (10, 70, 80, 90):
         checkpoint.save(checkpoint.step_path(tmp_path, steps), tree, {"env_steps": steps})
-    saver = BackgroundSaver(tmp_path, keep=2)
+    saver = BackgroundSaver(tmp_path, max_to_keep=2)
     saver.save(Part(checkpoint.step_path(tmp_path, 20), tree, {"env_steps": 20}))
     saver.wait()
     assert [int(path.name) for path in checkpoint.list_steps(tmp_path)] == [10, 20]
@@ -176,7 +176,7 @@ def test_later_checkpoints_do_not_crowd_out_new_ones(tmp_path):
 
 
 def test_an_interrupted_wait_does_not_forget_the_save(tmp_path, monkeypatch):
-    saver = BackgroundSaver(tmp_path, keep=1)
+    saver = BackgroundSaver(tmp_path, max_to_keep=1)
     saver.save(Part(checkpoint.step_path(tmp_path, 10), {"a": 1.0}, {"env_steps": 10}))
 
     def interrupted(running):
@@ -195,7 +195,7 @@ def test_what_a_crash_left_of_a_checkpoint_is_removed_and_of_a_policy_is_kept(tm
         checkpoint.save(tmp_path / name, {"a": 1.0}, {"env_steps": 10})
     for name in ("0000000000010", "best"):
         (tmp_path / name).rename(tmp_path / f".{name}.0123456789abcdef.unfinished")
-    checkpoint.prune(tmp_path, keep=2)
+    checkpoint.prune(tmp_path, max_to_keep=2)
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         ".best.0123456789abcdef.unfinished",
         "0000000000020",

@@ -9,7 +9,7 @@ from mjx_walk.storage.scores import read_scores, write_scores
 BLOCK = {"mean": 1.0, "std": 0.5}
 
 
-@pytest.mark.parametrize("name", ["path", "blocks", "facts", "env", "best", "versions", "checksum"])
+@pytest.mark.parametrize("name", ["path", "blocks", "metadata", "env", "best", "versions", "checksum"])
 def test_a_fact_of_any_name_neither_stops_nor_replaces_new_scores(tmp_path, name):
     path = tmp_path / "eval_gymnasium.json"
     one_block = {"returns": [2.0], "mean": 2.0, "std": 0.0}  # in which every other name is a fact
@@ -18,10 +18,10 @@ def test_a_fact_of_any_name_neither_stops_nor_replaces_new_scores(tmp_path, name
         former = read_scores(path)
     except ValueError:
         return  # a checksum, or another name of the file itself
-    write_scores(path, "Hopper-v5", {"best": BLOCK}, former.facts)
+    write_scores(path, "Hopper-v5", {"best": BLOCK}, former.metadata)
     found = read_scores(path)
     assert (found.env, found.blocks) == ("Hopper-v5", {"best": BLOCK})
-    assert isinstance(found.facts["versions"], dict)
+    assert isinstance(found.metadata["versions"], dict)
 
 
 @pytest.mark.parametrize("depth", [30, 500, 900, 990, 100_000])

@@ -25,7 +25,7 @@ from mjx_walk.training.distributed_checkpoint import restore_newest
 from mjx_walk.training.programs import make_init
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.types import mark_flags
+from mjx_walk.utils.types import leaves_with
 
 KEY = jax.random.PRNGKey(0)
 CALL = 2 * TINY_CALL
@@ -160,7 +160,7 @@ def own_leaves(tiny):
     config = load_config([*tiny, "hardware=cpu"])
     algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
     shapes = jax.eval_shape(algorithm.init, KEY)
-    return dict(zip(checkpoint._named_leaves(shapes), mark_flags(shapes, "per_device"), strict=True))
+    return dict(zip(checkpoint._named_leaves(shapes), leaves_with(shapes, "per_device"), strict=True))
 
 
 @pytest.mark.slow

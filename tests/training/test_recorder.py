@@ -58,20 +58,20 @@ def test_the_final_and_the_best_policy_are_kept(run, monkeypatch):
     recorder, algorithm, state, folder = run
     recorder.save(state, env_steps=4, wall_seconds=1.0)
     recorder.wait()
-    params, facts = kept(folder, "final", algorithm, state)
+    params, metadata = kept(folder, "final", algorithm, state)
     assert_same(params, algorithm.policy_params(state))
-    assert facts["env_steps"] == 4
+    assert metadata["env_steps"] == 4
     assert choose_policy(folder, "best") == "final"  # no evaluation has ended
 
     state, best = with_best(algorithm, state, best_return=3.0, best_iteration=5)
     recorder.save(state, env_steps=80, wall_seconds=2.0)
     recorder.wait()
-    params, facts = kept(folder, choose_policy(folder, "best"), algorithm, state)
+    params, metadata = kept(folder, choose_policy(folder, "best"), algorithm, state)
     assert_same(params, best)
-    assert (facts["env_steps"], facts["eval_return"]) == (20, 3.0)
-    params, facts = kept(folder, "final", algorithm, state)
+    assert (metadata["env_steps"], metadata["eval_return"]) == (20, 3.0)
+    params, metadata = kept(folder, "final", algorithm, state)
     assert_same(params, algorithm.policy_params(state))
-    assert facts["env_steps"] == 80
+    assert metadata["env_steps"] == 80
 
     written = []
     monkeypatch.setattr(recorder._saver, "save", lambda *parts: written.append([path.name for path, _, _ in parts]))
@@ -119,7 +119,7 @@ def test_both_policies_are_scored_and_the_scores_choose_nothing(run, monkeypatch
         "final": (final, 80),
         "best": (best, 20),
     }
-    assert file.env == "Walker2d-v5" and file.facts["wall_seconds"] == 1.0
+    assert file.env == "Walker2d-v5" and file.metadata["wall_seconds"] == 1.0
 
 
 def test_a_final_policy_with_the_highest_evaluation_is_also_the_best(run, monkeypatch):
@@ -138,9 +138,9 @@ def test_a_final_policy_with_the_highest_evaluation_is_also_the_best(run, monkey
     recorder.end(state, env_steps=80, evaluate=lambda params: 10.5)
     recorder.score(wall_seconds=1.0)
     recorder.wait()
-    params, facts = kept(folder, "best", algorithm, state)
+    params, metadata = kept(folder, "best", algorithm, state)
     assert_same(params, algorithm.policy_params(state))
-    assert facts == {"env_steps": 80, "eval_return": 10.5} and len(scored_policies) == 1
+    assert metadata == {"env_steps": 80, "eval_return": 10.5} and len(scored_policies) == 1
     blocks = read_scores(folder.gymnasium_scores).blocks
     assert blocks["final"] == blocks["best"] and blocks["best"]["eval_return"] == 10.5
 
@@ -155,15 +155,15 @@ def test_the_next_save_of_a_resumed_run_keeps_what_its_state_holds_as_the_best(r
     restored, _ = resumed.restore(state)
     resumed.save(restored, env_steps=84, wall_seconds=2.0)
     resumed.wait()
-    params, facts = kept(folder, "best", algorithm, state)
+    params, metadata = kept(folder, "best", algorithm, state)
     assert_same(params, best)
-    assert facts == {"env_steps": 20, "eval_return": 10.0}
+    assert metadata == {"env_steps": 20, "eval_return": 10.0}
 
 
 @pytest.mark.parametrize(("seeds", "kept_steps"), [(1, [8]), (2, [4, 8])])
 def test_seeds_that_train_together_keep_a_checkpoint_that_all_of_them_have(run, seeds, kept_steps):
     recorder, algorithm, state, folder = run
-    keep_one = dataclasses.replace(recorder.config.checkpoint, keep=1)
+    keep_one = dataclasses.replace(recorder.config.checkpoint, max_to_keep=1)
     config = dataclasses.replace(recorder.config, checkpoint=keep_one)
     recorder = Recorder(config, make_task(config), algorithm, folder, Processes(), seeds)
     for env_steps in (4, 8):
@@ -212,14 +212,14 @@ def test_a_policy_that_is_missing_or_damaged_is_in_the_checkpoint(run):
     recorder.wait()
     (folder.policy("best") / "meta.json").write_text("{")
     shutil.rmtree(folder.policy("final"))
-    for name, params, facts in (
+    for name, params, metadata in (
         ("best", best, {"env_steps": 20, "eval_return": 3.0}),
         ("final", algorithm.policy_params(state), {"env_steps": 80}),
     ):
         with pytest.warns(UserWarning, match=rf"{name}.* is .*; the policy of the checkpoint at step 80 is used"):
             loaded = SavedPolicy(folder, policy=name)
         assert_same(loaded.policy_params, params)
-        assert loaded.policy_facts == facts
+        assert loaded.policy_metadata == metadata
 
 
 def test_a_checkpoint_alone_can_be_scored(run, tmp_path):

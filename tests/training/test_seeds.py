@@ -83,14 +83,14 @@ class Saved:
     """A recorder with checkpoints at some steps."""
 
     def __init__(self, steps, seeds_together):
-        self.steps, self.facts = steps, {"seeds_together": seeds_together}
+        self.steps, self.metadata = steps, {"seeds_together": seeds_together}
 
     def restore(self, like, at_most=10**9):
-        return like, self.facts | {"env_steps": max((step for step in self.steps if step <= at_most), default=0)}
+        return like, self.metadata | {"env_steps": max((step for step in self.steps if step <= at_most), default=0)}
 
 
 def restored_steps(*recorders):
-    return [facts["env_steps"] for _, facts in restore_together(list(recorders), None)]
+    return [metadata["env_steps"] for _, metadata in restore_together(list(recorders), None)]
 
 
 def test_seeds_that_a_kill_has_parted_go_back_to_the_step_of_all():
@@ -101,13 +101,13 @@ def test_seeds_that_a_kill_has_parted_go_back_to_the_step_of_all():
             restored_steps(ahead, Saved([64], 2))
 
 
-@pytest.mark.parametrize(("steps", "facts", "is_refused"), [([64], 2, False), ([64], 1, True), ([64, 128], 2, True)])
-def test_seeds_that_a_kill_has_parted_at_their_first_save_begin_again(tmp_path, steps, facts, is_refused):
+@pytest.mark.parametrize(("steps", "metadata", "is_refused"), [([64], 2, False), ([64], 1, True), ([64, 128], 2, True)])
+def test_seeds_that_a_kill_has_parted_at_their_first_save_begin_again(tmp_path, steps, metadata, is_refused):
     folders = [RunFolder(tmp_path / f"seed_{seed}") for seed in (0, 1)]
     for step in steps:
         path = checkpoint.step_path(folders[1].checkpoints, step)
         path.parent.mkdir(parents=True, exist_ok=True)
-        checkpoint.save(path, {"a": 1.0}, {"env_steps": step, "seeds_together": facts}, as_numpy=True)
+        checkpoint.save(path, {"a": 1.0}, {"env_steps": step, "seeds_together": metadata}, as_numpy=True)
     if not is_refused:
         assert not have_saved(folders)
         return

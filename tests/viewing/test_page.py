@@ -67,10 +67,10 @@ def test_the_page_holds_the_episode_and_needs_nothing_else(tmp_path, episode):
 def test_every_shape_that_is_seen_is_drawn(tmp_path):
     model = mujoco.MjModel.from_xml_string(EVERY_SHAPE)
     standing = np.tile(model.qpos0, (2, 1))
-    facts = {"seconds_per_step": 0.1, "body": standing[:, :3], "motor_forces": np.zeros((2, 0)), "view": View()}
+    metadata = {"seconds_per_step": 0.1, "body": standing[:, :3], "motor_forces": np.zeros((2, 0)), "view": View()}
     nothing = {"floor_contacts": np.zeros((2, 2), bool), "frames": [], "steps_per_frame": 1}
     terms = {"reward_a</script>": np.ones(2)}
-    made = Episode("Own", model, qpos=standing, rewards=np.ones(2), reward_terms=terms, **facts, **nothing)
+    made = Episode("Own", model, qpos=standing, rewards=np.ones(2), reward_terms=terms, **metadata, **nothing)
     data = read_data(page.write_page(made, tmp_path / "own.html"))
     assert [geom["type"] for geom in data["geoms"]] == ["sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"]
     assert data["geoms"][4]["rgba"] == [1, 0, 0, 0.5] and data["floors"] == [-0.5]

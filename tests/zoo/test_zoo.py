@@ -40,7 +40,7 @@ def test_a_policy_is_small_and_scores_about_what_it_did(name):
 def test_its_command_gives_its_settings(name):
     folder = zoo.open_run(f"zoo:{name}")
     config = read_config(folder.config)
-    command = read_scores(folder.gymnasium_scores).facts["command"]
+    command = read_scores(folder.gymnasium_scores).metadata["command"]
     assert command == training_command(config)
     words = command.split()
     assert words[:3] == ["python", "-m", "mjx_walk.train"]
