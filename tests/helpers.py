@@ -31,7 +31,7 @@ from mjx_walk.viewing import rendering
 CLONE = Path(__file__).parent.parent
 PAGES = {path: path.read_text() for path in (CLONE / "README.md", *sorted((CLONE / "docs").rglob("*.md")))}
 """README and the pages of the documentation, by their paths."""
-OLD_RUNS = CLONE / "tests" / "runs" / "old_runs"
+OLD_RUNS = CLONE / "tests" / "storage" / "old_runs"
 """A run folder of each algorithm, written by an earlier version."""
 
 TINY = (

@@ -14,7 +14,6 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS, TaskOptions
 from mjx_walk.machine.devices import default_backend
 from mjx_walk.settings.own_tasks import KEY, name_task
-from mjx_walk.settings.recipes import base_recipe
 from mjx_walk.settings.renamed import present_overrides
 from mjx_walk.settings.schema import chosen, setting_types
 from mjx_walk.utils.errors import UserError
@@ -35,7 +34,7 @@ def complete_overrides(overrides: list[str], is_sweep: bool = False) -> list[str
     """Translate former names, quote text, add what follows from others, and refuse forms that bypass the schema.
 
     Without `hardware=` the size of the recipe follows from the devices that JAX sees. `env.task=` runs the file that it
-    names, and gives `env=`. A task or an algorithm of a user without `recipe=` gets that of `base_recipe`.
+    names, and gives `env=`.
 
     Args:
         overrides: arguments of the command line.
@@ -61,7 +60,7 @@ def complete_overrides(overrides: list[str], is_sweep: bool = False) -> list[str
     overrides = [str(override.input_line) for override in parsed]
     if not any(override.key_or_group == "hardware" for override in parsed):
         overrides = [f"hardware={'cpu' if default_backend() == 'cpu' else 'gpu'}", *overrides]
-    return _with_recipe(overrides)
+    return overrides
 
 
 def key_of_value(value: str) -> str | None:
@@ -111,15 +110,6 @@ def _with_whole_numbers(overrides: list[str]) -> list[str]:
             override = f"{key}={','.join(map(with_whole_number, value.split(',')))}"
         whole.append(override)
     return whole
-
-
-def _with_recipe(overrides: list[str]) -> list[str]:
-    """Overrides with the recipe for a task or an algorithm of a user, unless one is given."""
-    given = {"env": "humanoid", "algo": "ppo"} | dict(override.split("=", 1) for override in overrides)
-    if "recipe" in given or given["env"] not in TASKS or given["algo"] not in ALGORITHMS:  # a sweep has several
-        return overrides
-    recipe = base_recipe(given["env"], given["algo"], given["hardware"])
-    return [*overrides, f"recipe={recipe}"] if recipe else overrides
 
 
 def _quote_texts(overrides: list[str], is_sweep: bool) -> list[str]:

@@ -1,6 +1,7 @@
 """Recipes in files of the user: `recipe=PATH`."""
 
 import hashlib
+import itertools
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +14,9 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mjx_walk.settings.recipes import CONFIG_DIR
+from mjx_walk.algos import ALGORITHMS
+from mjx_walk.envs import TASKS
+from mjx_walk.settings.recipes import CONFIG_DIR, HARDWARE, fallback, has_file
 from mjx_walk.storage.files import read_bytes, user_path
 from mjx_walk.utils.errors import UserError, first_line
 
@@ -50,15 +53,19 @@ def recipe_file(name: str, folder: Path | None = None) -> Path | None:
 
 
 def _shipped_file(name: str) -> Path:
-    return _RECIPES / f"{name.removesuffix('.yaml')}.yaml"
+    name = name.removesuffix(".yaml")
+    return _RECIPES / f"{fallback(name) or name}.yaml"
 
 
 def _is_shipped(name: str) -> bool:
-    return not name.startswith((".", "/", "~")) and _shipped_file(name).is_file()
+    name = name.removesuffix(".yaml")
+    return not name.startswith((".", "/", "~")) and (has_file(name) or fallback(name) is not None)
 
 
 def with_stored_recipes(overrides: list[str], store: ConfigStore) -> list[str]:
     """Overrides in which recipe files have the names under which Hydra finds them in the store.
+
+    Recipes of this package without a file are stored, too.
 
     Args:
         overrides: completed arguments of the command line.
@@ -67,7 +74,25 @@ def with_stored_recipes(overrides: list[str], store: ConfigStore) -> list[str]:
     Raises:
         UserError: a file is missing, is no recipe, or inherits from one that is not.
     """
+    for name in _shipped_names(overrides):
+        parent = fallback(name)
+        if parent is not None:
+            defaults = [f"/recipe/{parent}", _SELF] if parent else [_SELF]
+            group, _, stem = name.partition("/")
+            store.store(group=f"recipe/{group}", name=stem, node={"defaults": defaults}, package="_global_")
     return [_with_stored_recipe(text, store) if text.startswith("recipe=") else text for text in overrides]
+
+
+def _shipped_names(overrides: list[str]) -> list[str]:
+    """Names of recipes of this package for which overrides ask, with several values in a sweep."""
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    given = {override.key_or_group: _values(override) for override in parsed}
+    if given.get("recipe"):
+        return given["recipe"]
+    all_values = {"hardware": HARDWARE, "env": TASKS, "algo": ALGORITHMS}
+    usual = {"env": ["humanoid"], "algo": ["ppo"]}
+    sizes, envs, algos = (given.get(key, usual.get(key)) or list(values) for key, values in all_values.items())
+    return [f"{size}/{env}_{algo}" for size, env, algo in itertools.product(sizes, envs, algos)]
 
 
 def with_paths(message: str) -> str:

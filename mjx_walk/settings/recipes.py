@@ -1,38 +1,55 @@
-"""The recipes among the configuration files, and which one applies to a task and an algorithm."""
+"""The recipes among the configuration files, and which one applies to a task and an algorithm.
+
+`HARDWARE/ENV_ALGO` need not have a file. Without one it takes the settings of `HARDWARE/ALGO`, the defaults there.
+"""
 
 from pathlib import Path
 
 from mjx_walk.algos import ALGORITHMS, BUILT_IN_ALGORITHMS
 from mjx_walk.envs import BUILT_IN_TASKS, TASKS
 
-__all__ = ["CONFIG_DIR", "base_recipe", "fitting_recipes", "recipe_names"]
+__all__ = ["CONFIG_DIR", "HARDWARE", "fallback", "fitting_recipes", "has_file", "recipe_names"]
 
 CONFIG_DIR = str(Path(__file__).parents[1] / "configs")
 """Folder of the Hydra groups and recipes."""
 
-_BASE_TASK = "walker2d"
-"""Task whose recipes apply to tasks of users that derive from no other task."""
+HARDWARE = ("cpu", "gpu")
+"""Values of `hardware=`."""
 
 
 def recipe_names() -> list[str]:
     """Valid values of `recipe=`, such as `cpu/humanoid_ppo`."""
     folder = Path(CONFIG_DIR) / "recipe"
-    return sorted(str(path.relative_to(folder).with_suffix("")) for path in folder.glob("**/[!_]*.yaml"))
+    names = {str(path.relative_to(folder).with_suffix("")) for path in folder.glob("**/[!_]*.yaml")}
+    return sorted(names | {f"{size}/{env}_{algo}" for size in HARDWARE for env in TASKS for algo in ALGORITHMS})
 
 
-def base_recipe(env: str, algo: str, hardware: str) -> str | None:
-    """The recipe for a task or an algorithm that a user has registered. None for those of this package.
+def has_file(name: str) -> bool:
+    """Whether a recipe of this package has a file of its own."""
+    return (Path(CONFIG_DIR) / "recipe" / f"{name}.yaml").is_file()
 
-    It is the recipe of the task and the algorithm of this package from which the classes derive. A task that derives
-    from none takes Walker2d's. An algorithm that derives from none takes no recipe, `null`.
+
+def fallback(name: str) -> str | None:
+    """The recipe from which `HARDWARE/ENV_ALGO` without a file takes its settings. None for other names.
+
+    A task or an algorithm of a user counts as the one of this package from which its class derives. A task that derives
+    from none takes the algorithm's defaults. An algorithm that derives from none takes no recipe, `""`.
     """
-    if env in BUILT_IN_TASKS and algo in BUILT_IN_ALGORITHMS:
+    if has_file(name):
         return None
-    tasks = {TASKS[name][0]: name for name in BUILT_IN_TASKS}
-    configs = {ALGORITHMS[name][1]: name for name in BUILT_IN_ALGORITHMS}
-    task = next((tasks[kind] for kind in TASKS[env][0].__mro__ if kind in tasks), _BASE_TASK)
-    algorithm = next((configs[kind] for kind in ALGORITHMS[algo][1].__mro__ if kind in configs), None)
-    return f"{hardware}/{task}_{algorithm}" if algorithm else "null"
+    size, _, both = name.partition("/")
+    pairs = (both.removesuffix(f"_{algo}") for algo in ALGORITHMS if both.endswith(f"_{algo}"))
+    env = next((env for env in pairs if env in TASKS), None)
+    if size not in HARDWARE or env is None:
+        return None
+    tasks = {TASKS[known][0]: known for known in BUILT_IN_TASKS}
+    configs = {ALGORITHMS[known][1]: known for known in BUILT_IN_ALGORITHMS}
+    task = next((tasks[kind] for kind in TASKS[env][0].__mro__ if kind in tasks), None)
+    kinds = ALGORITHMS[both.removeprefix(f"{env}_")][1].__mro__
+    algo = next((configs[kind] for kind in kinds if kind in configs), None)
+    if algo is None:
+        return ""
+    return next(found for found in (f"{size}/{task}_{algo}", f"{size}/{algo}") if has_file(found))
 
 
 def fitting_recipes(env: str, algo: str) -> str:

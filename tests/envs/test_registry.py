@@ -14,7 +14,7 @@ from mjx_walk.algos.base import Algorithm
 from mjx_walk.envs import TASKS, Task, TaskOptions, make_env, registry
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
-from mjx_walk.settings.recipes import base_recipe
+from mjx_walk.settings.recipes import fallback
 from mjx_walk.utils.errors import UserError
 
 
@@ -141,8 +141,8 @@ def test_mistakes_with_algorithms(arguments, says):
 
 
 def test_recipes_follow_the_classes():
-    assert base_recipe("ant", "ppo", "cpu") is None
+    assert fallback("cpu/backward_ppo") is None
     mjx_walk.register_task("backward", Backward)
     mjx_walk.register_algorithm("greedy", Greedy, GreedyConfig)
-    assert base_recipe("backward", "sac", "gpu") == "gpu/walker2d_sac"
-    assert base_recipe("ant", "greedy", "cpu") == "cpu/ant_ppo"
+    assert fallback("gpu/backward_sac") == "gpu/sac"
+    assert fallback("cpu/ant_greedy") == "cpu/ant_ppo"

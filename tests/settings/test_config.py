@@ -15,14 +15,15 @@ from mjx_walk.api import make_task, resolve
 from mjx_walk.envs import TASKS
 from mjx_walk.experiments import planned_runs
 from mjx_walk.settings.config import CONFIG_DIR, flatten, load_config, recipe_names, training_command
+from mjx_walk.settings.recipes import HARDWARE, fallback
 from mjx_walk.settings.saved_config import read_config, save_config
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import describe, has_effect
 
-RECIPES = sorted(
-    str(path.relative_to(f"{CONFIG_DIR}/recipe"))[:-5] for path in Path(CONFIG_DIR).glob("recipe/?pu/[!_]*.yaml")
+RECIPES = [f"{size}/{env}_{algo}" for size in HARDWARE for env in TASKS for algo in ALGORITHMS]
+FILES = sorted(
+    str(path.relative_to(f"{CONFIG_DIR}/recipe"))[:-5] for path in Path(CONFIG_DIR).glob("recipe/*/[!_]*.yaml")
 )
-ALL_RECIPES = recipe_names()
 
 LONGER_SCHEDULES = {"cpu/humanoid_ppo": 3_000_000}
 """Of the recipes that end before their schedule. All others anneal to the end."""
@@ -52,27 +53,26 @@ def test_every_recipe_fits(recipe):
     assert algorithm.steps_per_iteration * config.iterations_per_call < config.total_steps / 20
 
 
-def test_there_is_a_recipe_for_every_task_on_every_hardware():
-    assert len(RECIPES) == 2 * len(TASKS) * len(ALGORITHMS)
-
-
-def settings_of(path):
-    """All keys that a recipe and the recipes below it set."""
-    content = yaml.safe_load(path.read_text())
-    parents = [name for name in content.pop("defaults", []) if isinstance(name, str) and name != "_self_"]
-    keys = [f"{key}.{name}" for key, value in content.items() if isinstance(value, dict) for name in value]
-    keys += [key for key, value in content.items() if not isinstance(value, dict)]
-    for parent in parents:
-        folder, _, name = parent.rpartition("/")
-        keys += settings_of(path.parents[1] / (Path(folder).name or path.parent.name) / f"{name}.yaml")
-    return keys
-
-
-@pytest.mark.parametrize("recipe", ALL_RECIPES)
+@pytest.mark.parametrize("recipe", [name for name in FILES if not name.startswith("report/")])
 def test_no_recipe_gives_a_setting_without_effect(recipe):
-    config = load_recipe(recipe)
-    given = settings_of(Path(CONFIG_DIR) / "recipe" / f"{recipe}.yaml")
-    assert len(given) > 5 and [key for key in given if not has_effect(config, key)] == []
+    """For the defaults of an algorithm, on Walker2d."""
+    size, _, name = recipe.partition("/")
+    config = load_recipe(recipe if "_" in name else f"{size}/walker2d_{name}")
+    content = yaml.safe_load((Path(CONFIG_DIR) / "recipe" / f"{recipe}.yaml").read_text())
+    content.pop("defaults", None)
+    given = [f"{key}.{name}" for key, value in content.items() if isinstance(value, dict) for name in value]
+    given += [key for key, value in content.items() if not isinstance(value, dict)]
+    assert given and [key for key in given if not has_effect(config, key)] == []
+
+
+def test_a_task_without_a_recipe_takes_the_defaults_of_the_algorithm():
+    """Under every name that a recipe has: alone, given, inherited from, and in a sweep."""
+    assert fallback("gpu/ant_ppo") == "gpu/ppo" and fallback("gpu/humanoid_ppo") is None is fallback("gpu/ppo")
+    base = ["env=ant", "algo=csac", "hardware=gpu"]
+    expected = load_config([*base, "recipe=gpu/csac"])
+    assert load_config(base) == load_config([*base, "recipe=gpu/ant_csac"]) == expected
+    assert expected.algo.discount == 0.99 and expected.algo.reward_scale == 1.0
+    assert {"gpu/ant_csac", "gpu/csac", "report/c_sac"} <= {*recipe_names()}
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in Path(CONFIG_DIR).glob("recipe/report/*.yaml")))
