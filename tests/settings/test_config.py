@@ -58,7 +58,7 @@ def test_no_recipe_gives_a_setting_without_effect(recipe):
     """For the defaults of an algorithm, on Walker2d."""
     size, _, name = recipe.partition("/")
     config = load_recipe(recipe if "_" in name else f"{size}/walker2d_{name}")
-    content = yaml.safe_load((Path(CONFIG_DIR) / "recipe" / f"{recipe}.yaml").read_text())
+    content = yaml.safe_load((FOLDER / f"{recipe}.yaml").read_text())
     content.pop("defaults", None)
     given = [f"{key}.{name}" for key, value in content.items() if isinstance(value, dict) for name in value]
     given += [key for key, value in content.items() if not isinstance(value, dict)]
