@@ -1,7 +1,6 @@
 """Trainings of one test process that differ in steps, seed and folder alone are traced and compiled once."""
 
 import contextlib
-import functools
 from typing import Any
 
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from mjx_walk.algos import make_algorithm
 from mjx_walk.envs import BUILT_IN_TASKS
 from mjx_walk.evaluation.saved_policies import make_task
-from mjx_walk.training.programs import make_seeds_program, make_single_program
+from mjx_walk.training.programs import make_program
 
 _MADE: dict[Any, Any] = {}
 """Tasks on the `c` engine, their algorithms and the programs of these, by their settings."""
@@ -21,8 +20,7 @@ def shared_programs():
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("mjx_walk.api.make_task", _task)
         patched.setattr("mjx_walk.training.trainer.make_algorithm", _algorithm)
-        for make in (make_single_program, make_seeds_program):
-            patched.setattr(f"mjx_walk.training.trainer.{make.__name__}", functools.partial(_program, make))
+        patched.setattr("mjx_walk.training.trainer.make_program", _program)
         yield
 
 
@@ -45,8 +43,8 @@ def _algorithm(task, num_envs, evaluation, algo, axis_name=None):
     return _once((task, *settings), build) if task in _MADE.values() else build()
 
 
-def _program(make, algorithm, *settings):
+def _program(algorithm, *settings):
     def build():
-        return make(algorithm, *settings)
+        return make_program(algorithm, *settings)
 
-    return _once((make, algorithm, *settings), build) if algorithm in _MADE.values() else build()
+    return _once((algorithm, *settings), build) if algorithm in _MADE.values() else build()

@@ -20,10 +20,11 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint import multihost
 
 from mjx_walk.algos import Algorithm, TrainState
-from mjx_walk.training.programs import Program, Step, make_axis_program, make_init
 from mjx_walk.utils import collectives
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.types import Metric, Metrics, Reduction, map_leaves_with
+
+__all__ = ["DevicesStep", "Processes", "in_place", "init_on_device", "join_processes", "per_device"]
 
 _PATH_BYTES = 4096
 _TIMEOUT = 3600
@@ -42,6 +43,11 @@ class Processes:
     def is_main_process(self) -> bool:
         """Whether this process writes the run folder."""
         return self.process_index == 0
+
+    @property
+    def axis_name(self) -> str | None:
+        """Name of the mapped axis over the devices in `Algorithm.learn`. None for one device."""
+        return DEVICES if self.process_count > 1 else None
 
     def wait_for_all(self) -> None:
         """Wait until all processes reach this call. On CPUs, a program over all devices waits only half a minute."""
@@ -88,28 +94,7 @@ def per_device(config: Any, process_count: int) -> Any:
     return dataclasses.replace(config, **{name: -(-getattr(config, name) // process_count) for name in names})
 
 
-def make_devices_program(algorithm: Algorithm, processes: Processes, iterations_per_call: int) -> Program:
-    """Program of one run on the devices of all processes. States have a leading axis of length one.
-
-    Args:
-        algorithm: algorithm with the axis name `DEVICES`.
-        processes: processes of the run.
-        iterations_per_call: number of iterations in a call.
-    """
-    init = make_init(functools.partial(_init_on_device, algorithm, processes.process_index))
-    return make_axis_program(
-        algorithm,
-        1,
-        init=lambda keys: init(keys[0]),
-        step=_make_step(algorithm, processes, iterations_per_call),
-        # The step needs arrays over all devices.
-        lower=lambda keys, restored: [init.lower(keys[0])] if restored is None else [],
-        split_metrics=lambda metrics: [_squeeze(jax.device_get(metrics))],
-        max_over_processes=lambda number: max(processes.all_gather(number)),
-    )
-
-
-def _init_on_device(algorithm: Algorithm, process_index: int, key: jax.Array) -> TrainState:
+def init_on_device(algorithm: Algorithm, process_index: int, key: jax.Array) -> TrainState:
     """Initial state of a device. Leaves that are per device start from the device's own key."""
     shared, own = algorithm.init(key), algorithm.init(jax.random.fold_in(key, process_index))
     state = map_leaves_with(lambda _, leaf: leaf, "per_device", shared, own)
@@ -118,72 +103,90 @@ def _init_on_device(algorithm: Algorithm, process_index: int, key: jax.Array) ->
     return _expand(state.replace(evaluation=state.evaluation.replace(**policies)))
 
 
-def _make_step(algorithm: Algorithm, processes: Processes, iterations_per_call: int) -> Step:
-    """Like `programs.make_step`, with metrics over all devices.
+class DevicesStep:
+    """Several iterations on the devices of all processes: `state → (state, metrics)`, with metrics over all devices.
 
     The results of an iteration take the memory of the one before, so that the arrays of physics do not move.
     """
-    devices = sorted(jax.devices(), key=lambda device: device.process_index)
-    sharding = NamedSharding(Mesh(np.array(devices), (DEVICES,)), PartitionSpec(DEVICES))
 
-    @functools.partial(jax.jit, inline=True)  # traced once for both the sizes and the program
-    def collect(state):
-        return _expand(algorithm.collect(_squeeze(state)))
+    def __init__(self, algorithm: Algorithm, iterations_per_call: int, processes: Processes):
+        """
+        Args:
+            algorithm: algorithm with the axis name `DEVICES`.
+            iterations_per_call: iterations of a call.
+            processes: processes of the run.
+        """
+        self._iterations_per_call = iterations_per_call
+        self._processes = processes
+        devices = sorted(jax.devices(), key=lambda device: device.process_index)
+        self._sharding = NamedSharding(Mesh(np.array(devices), (DEVICES,)), PartitionSpec(DEVICES))
+        # Inline programs are traced once for both their shapes and the program around them.
+        self._collect = jax.jit(functools.partial(_collect, algorithm), inline=True)
+        self._collect_in_place = in_place(self._collect)
+        self._learn = jax.jit(_over_all_devices(functools.partial(_learn, algorithm), self._sharding), inline=True)
+        self._learn_and_log = jax.jit(
+            functools.partial(_learn_and_log, self._learn), donate_argnums=(0, 2), out_shardings=self._sharding
+        )
+        self._compiled: jax.stages.Compiled | None = None
+        self._row_shapes: Metrics = {}
+        self._batch: Any = None
+        """The last batch, in whose memory the next one is collected."""
 
-    learn = _learn_together(algorithm, sharding)
-
-    @functools.partial(jax.jit, donate_argnums=(0, 2), out_shardings=sharding)
-    def learn_and_log(state, batch, rows, index):
-        state, metrics = learn(state, batch)
-        return state, jax.tree.map(lambda row, x: row.at[:, index].set(x), rows, metrics)
-
-    def share(x: jax.Array) -> jax.Array:
-        """Array over all devices with this process's part in place. Copies nothing."""
-        shape = (processes.process_count, *x.shape[1:])
-        return jax.make_array_from_single_device_arrays(shape, sharding, [x])
-
-    collect_in_place = in_place(collect)
-    compiled: list[Callable] = []
-    batches: list[Any] = []
-    row_shapes: list[Metrics] = []
-
-    def step(state: TrainState) -> tuple[TrainState, Metrics]:
-        if not batches:
-            batches.append(jax.tree.map(jnp.zeros_like, jax.eval_shape(collect, state)[1]))
+    def __call__(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        """One call."""
+        if self._batch is None:
+            self._batch = jax.tree.map(jnp.zeros_like, jax.eval_shape(self._collect, state)[1])
         rows: Metrics = {}
-        for index in range(iterations_per_call):
-            state, batch = collect_in_place(state, batches.pop())
-            batches.append(batch)
-            shared = jax.tree.map(share, (state, batch))
-            if not row_shapes:
-                row_shapes.append(jax.eval_shape(learn, *shared)[1])
-            if not rows:
-                rows = jax.tree.map(lambda x: jnp.zeros((1, iterations_per_call), x.dtype), row_shapes[0])
-            arguments = (*shared, jax.tree.map(share, rows), np.int32(index))
-            if not compiled:
-                compiled.append(learn_and_log.lower(*arguments).compile())
-                processes.wait_for_all()
-            state, rows = jax.tree.map(lambda x: x.addressable_data(0), compiled[0](*arguments))
+        for index in range(self._iterations_per_call):
+            state, self._batch = self._collect_in_place(state, self._batch)
+            state, rows = self._learn_from(state, self._batch, rows, index)
         return state, rows
 
-    return step
+    def _learn_from(self, state: TrainState, batch: Any, rows: Metrics, index: int) -> tuple[TrainState, Metrics]:
+        """Learn from the batches of all devices, and write the metrics at an index of the rows."""
+        shared = jax.tree.map(self._share, (state, batch))
+        if not self._row_shapes:
+            self._row_shapes = jax.eval_shape(self._learn, *shared)[1]
+        if not rows:
+            rows = jax.tree.map(lambda x: jnp.zeros((1, self._iterations_per_call), x.dtype), self._row_shapes)
+        arguments = (*shared, jax.tree.map(self._share, rows), np.int32(index))
+        if self._compiled is None:
+            self._compiled = self._learn_and_log.lower(*arguments).compile()
+            self._processes.wait_for_all()
+        return jax.tree.map(lambda x: x.addressable_data(0), self._compiled(*arguments))
+
+    def _share(self, x: jax.Array) -> jax.Array:
+        """Array over all devices with this process's part in place. Copies nothing."""
+        shape = (self._processes.process_count, *x.shape[1:])
+        return jax.make_array_from_single_device_arrays(shape, self._sharding, [x])
 
 
-def _learn_together(algorithm: Algorithm, sharding: NamedSharding) -> Callable[[Any, Any], tuple[Any, Metrics]]:
-    """`learn` over all devices: `(state, batch) → (state, metrics)`, with an axis of devices in front."""
+def _collect(algorithm: Algorithm, state: TrainState) -> tuple[TrainState, Any]:
+    return _expand(algorithm.collect(_squeeze(state)))
 
-    def learn(state, batch):
-        state, metrics = algorithm.learn(_squeeze(state), _squeeze(batch))
-        return _expand((state, {name: _over_devices(metric) for name, metric in metrics.items()}))
 
-    mapped = jax.shard_map(
-        learn,
+def _learn(algorithm: Algorithm, state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
+    """Learn on one device, with metrics over all of them."""
+    state, metrics = algorithm.learn(_squeeze(state), _squeeze(batch))
+    return _expand((state, {name: _over_devices(metric) for name, metric in metrics.items()}))
+
+
+def _learn_and_log(
+    learn: Callable, state: TrainState, batch: Any, rows: Metrics, index: jax.Array
+) -> tuple[TrainState, Metrics]:
+    state, metrics = learn(state, batch)
+    return state, jax.tree.map(lambda row, x: row.at[:, index].set(x), rows, metrics)
+
+
+def _over_all_devices(function: Callable, sharding: NamedSharding) -> Callable:
+    """Map a function over the axis of devices in front of its arguments and results."""
+    return jax.shard_map(
+        function,
         mesh=sharding.mesh,
         in_specs=PartitionSpec(DEVICES),
         out_specs=PartitionSpec(DEVICES),
         check_vma=False,  # Brax's networks and losses do not annotate it
     )
-    return jax.jit(mapped, inline=True)  # traced once for both the metrics' types and the program
 
 
 def in_place(collect: Callable[[Any], tuple[Any, Any]]) -> Callable[[Any, Any], tuple[Any, Any]]:

@@ -201,10 +201,14 @@ class Recorder:
             write_scores(self._folder.gymnasium_scores, self._task.gymnasium_id, blocks, {"wall_seconds": wall_seconds})
         return scored
 
-    def wait(self) -> None:
-        """Wait until all files are on disk."""
+    def wait_for_save(self) -> None:
+        """Wait until the last save is complete."""
         with self._writing():
             self._saver.wait()
+
+    def wait(self) -> None:
+        """Wait until all files are on disk."""
+        self.wait_for_save()
         if self._filmer:
             self._filmer.wait()
 
@@ -216,8 +220,7 @@ class Recorder:
     def close(self) -> None:
         """Finish the checkpoint that is being written, and close the logs, however training has ended."""
         try:
-            with self._writing():
-                self._saver.wait()
+            self.wait_for_save()
         finally:
             self._close_logs()
 

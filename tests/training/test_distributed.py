@@ -20,7 +20,7 @@ from mjx_walk.evaluation.saved_policies import make_task
 from mjx_walk.logs.metrics import read_rows
 from mjx_walk.settings.config import load_config
 from mjx_walk.storage import checkpoint
-from mjx_walk.training.distributed import Processes, _init_on_device, in_place, per_device
+from mjx_walk.training.distributed import Processes, in_place, init_on_device, per_device
 from mjx_walk.training.distributed_checkpoint import restore_newest
 from mjx_walk.training.programs import make_init
 from mjx_walk.utils.collectives import DEVICES
@@ -35,7 +35,7 @@ CALL = 2 * TINY_CALL
 def test_every_device_first_evaluates_the_policy_that_acts():
     config = load_config([*TINY, "hardware=cpu"])
     algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
-    states = [_init_on_device(algorithm, index, KEY) for index in (0, 1)]
+    states = [init_on_device(algorithm, index, KEY) for index in (0, 1)]
     for state in states:
         acting = algorithm.policy_params(state)
         jax.tree.map(np.testing.assert_array_equal, state.evaluation.policy_params, acting)

@@ -12,8 +12,8 @@ from mjx_walk.settings.config import load_config
 from mjx_walk.settings.saved_config import save_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.run_folder import RunFolder
-from mjx_walk.training import seeds_together
-from mjx_walk.training.seeds_together import have_saved, restore_together
+from mjx_walk.training import recorders
+from mjx_walk.training.recorders import have_saved, restore_together
 from mjx_walk.utils.errors import UnreadableError, UserError
 
 SEEDS = "seeds=[3,5]"
@@ -89,8 +89,8 @@ class Saved:
         return like, self.metadata | {"env_steps": max((step for step in self.steps if step <= at_most), default=0)}
 
 
-def restored_steps(*recorders):
-    return [metadata["env_steps"] for _, metadata in restore_together(list(recorders), None)]
+def restored_steps(*runs):
+    return [metadata["env_steps"] for _, metadata in restore_together(runs, None)]
 
 
 def test_seeds_that_a_kill_has_parted_go_back_to_the_step_of_all():
@@ -120,7 +120,7 @@ def test_seeds_of_which_one_cannot_be_read_now_neither_begin_again_nor_part(tmp_
         raise UnreadableError(f"cannot read {path}")
 
     (tmp_path / "1" / "checkpoints" / f"{10:013d}").mkdir(parents=True)
-    monkeypatch.setattr(seeds_together, "read_meta", fail)
+    monkeypatch.setattr(recorders, "read_meta", fail)
     with pytest.raises(UnreadableError, match="cannot read"):
         have_saved([RunFolder(tmp_path / name) for name in ("1", "2")])
 

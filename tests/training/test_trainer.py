@@ -70,19 +70,19 @@ def test_each_program_is_compiled_once(seeds, tmp_path, monkeypatch):
         compiled.append([])
         steps = f"total_steps={calls * TINY_CALL}"
         train_command.main([*TINY, seeds, f"run_dir={tmp_path / 'run'}", steps, f"resume={resume}"])
-    counts = [[names.count(f"jit_{name}") for name in ("strong", "collect", "learn")] for names in compiled]
+    counts = [[names.count(f"jit_{name}") for name in ("_strong_init", "collect", "learn")] for names in compiled]
     assert counts == [[1, 1, 1], [0, 1, 1]]
 
 
 def test_a_call_is_logged_before_the_next_begins(tmp_path, monkeypatch):
     """A row's seconds and speed are those of its own call."""
-    events, step = [], programs._TwoPrograms.__call__
+    events, step = [], programs.SeparateSteps.__call__
 
     def begin(self, state):
         events.append("begins")
         return step(self, state)
 
-    monkeypatch.setattr(programs._TwoPrograms, "__call__", begin)
+    monkeypatch.setattr(programs.SeparateSteps, "__call__", begin)
     overrides = [*TINY, f"run_dir={tmp_path / 'run'}", f"total_steps={3 * TINY_CALL}"]
     with shared_programs():
         mjx_walk.run(overrides, on_metrics=lambda row: events.append("is logged"))
