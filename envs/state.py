@@ -1,6 +1,6 @@
 """The contract between tasks and trainers: the state of an environment, and what a trainer needs of a task."""
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import flax
 import jax.numpy as jnp
@@ -70,6 +70,7 @@ def is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[A
     return jnp.array([jnp.all(jnp.abs(x) < limit) for x in arrays]).all()
 
 
+@runtime_checkable
 class TrainableTask(Protocol):
     """What a trainer needs of a task. All methods are pure functions of one unbatched environment."""
 
