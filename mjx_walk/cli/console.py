@@ -54,7 +54,7 @@ class _Output:
         os.dup2(nowhere, self._stream.fileno())
         os.close(nowhere)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         return getattr(self._stream, name)
 
 
@@ -92,7 +92,7 @@ def _is_not_about_gpus(record: logging.LogRecord) -> bool:
     return not record.getMessage().startswith(("An NVIDIA GPU may be present", "CUDA backend failed to initialize"))
 
 
-def _say_nothing_of_interrupts(unraisable: Any) -> None:
+def _say_nothing_of_interrupts(unraisable: "sys.UnraisableHookArgs") -> None:
     """Hide a Ctrl-C that meets code which cannot raise, such as a callback of the garbage collector."""
     if not (unraisable.exc_type and issubclass(unraisable.exc_type, KeyboardInterrupt)):
         sys.__unraisablehook__(unraisable)

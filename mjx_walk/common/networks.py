@@ -202,7 +202,7 @@ def make_critics(
         params: Params,
         obs: Float[Array, "*batch observation_size"],
         action: Float[Array, "*batch action_size"],
-    ) -> Float[Array, "*batch {num_critics} {num_outputs}"]:
+    ) -> Float[Array, "*batch num_critics num_outputs"]:
         inputs = jnp.concatenate([obs, action, jnp.zeros((*obs.shape[:-1], padding), obs.dtype)], axis=-1)
         return jax.vmap(critic.apply, (0, None), -2)(params, inputs.astype(config.network_dtype))
 

@@ -9,7 +9,7 @@ import os
 import pickle
 import sys
 import warnings
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
@@ -50,7 +50,7 @@ def serve() -> None:
         send(answers, (obs, rewards, is_over))
 
 
-def send(pipe: IO[bytes], message: Any) -> None:
+def send(pipe: IO[bytes], message: object) -> None:
     """Write one message to a pipe, and flush it."""
     pickle.dump(message, pipe, protocol=pickle.HIGHEST_PROTOCOL)
     pipe.flush()

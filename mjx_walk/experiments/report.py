@@ -1,7 +1,6 @@
 """The report on runs of one environment: learning curves, Markdown tables and a CSV file."""
 
 from pathlib import Path
-from typing import Any
 
 import matplotlib.figure
 import numpy as np
@@ -138,7 +137,7 @@ def run_cells(variant: str, run: LoggedRun) -> dict[str, str]:
     }
 
 
-def csv_row(variant: str, run: LoggedRun) -> dict[str, Any]:
+def csv_row(variant: str, run: LoggedRun) -> dict[str, object]:
     """Values about one run, by column."""
     last = run.rows[-1]
     scores = {f"{policy}_{name}": run.score(policy).get(name) for policy in (FINAL, BEST) for name in ("mean", "std")}

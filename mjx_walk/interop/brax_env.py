@@ -56,7 +56,7 @@ class BraxEnv(base.Env):
     It has no time limit of its own; Brax's `EpisodeWrapper` adds one, as for Brax's environments.
     """
 
-    def __init__(self, env: str, physics: str = "auto", **keywords: Any):
+    def __init__(self, env: str, physics: str = "auto", **keywords: object):
         """
         Args:
             env: name of the task.
@@ -183,6 +183,6 @@ def _check_switches(changes: dict[str, jax.Array], model: mujoco.MjModel) -> Non
             raise UserError(f"the model has no {' or '.join(group)}, so MJX does not read '{name}'; give it a value")
 
 
-def _dotted(path: tuple[Any, ...]) -> str:
+def _dotted(path: tuple[object, ...]) -> str:
     """Path of a leaf as `tree_replace` takes it, such as `opt.gravity`."""
     return jax.tree_util.keystr(path, simple=True, separator=".")

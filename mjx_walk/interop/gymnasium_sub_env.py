@@ -1,6 +1,6 @@
 """One environment of the vector environment, for code that asks for its attributes."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium
 import jax
@@ -28,12 +28,12 @@ class SubEnv(MujocoAttributes):
         return self._vector_env.render_mode
 
     @property
-    def metadata(self) -> dict[str, Any]:
+    def metadata(self) -> dict[str, object]:
         """Gymnasium's for one environment."""
         return {name: value for name, value in self._vector_env.metadata.items() if name != "autoreset_mode"}
 
     @property
-    def spec(self) -> Any:
+    def spec(self) -> object:
         return self._vector_env.spec
 
     @property
@@ -53,7 +53,7 @@ class SubEnv(MujocoAttributes):
         """Itself: no wrapper is around one environment."""
         return self
 
-    def get_wrapper_attr(self, name: str) -> Any:
+    def get_wrapper_attr(self, name: str) -> object:
         """An attribute, as `gymnasium.Env.get_wrapper_attr` finds it."""
         return getattr(self, name)
 
@@ -61,7 +61,7 @@ class SubEnv(MujocoAttributes):
         """Whether there is an attribute."""
         return hasattr(self, name)
 
-    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+    def set_wrapper_attr(self, name: str, value: object, *, force: bool = True) -> bool:
         """Set an attribute; without `force`, only one that exists. Returns whether it was set."""
         if force or hasattr(self, name):
             setattr(self, name, value)

@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-from typing import Any
 
 import jax
 
@@ -62,7 +61,7 @@ def default_device() -> jax.Device:
     return chosen or jax.local_devices()[0]
 
 
-def num_bytes(tree: Any) -> int:
+def num_bytes(tree: object) -> int:
     """Bytes of a pytree of arrays or of their shapes and dtypes."""
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
 

@@ -6,7 +6,6 @@ import json
 import shlex
 import warnings
 from pathlib import Path
-from typing import Any
 
 from mjx_walk.envs import TASKS, Task, TaskOptions
 from mjx_walk.envs.model_files import changed_names, model_path, source_hashes
@@ -152,7 +151,7 @@ def _read(folder: RunFolder) -> Inputs:
     return {}
 
 
-def _are_inputs(content: Any) -> bool:
+def _are_inputs(content: object) -> bool:
     if not isinstance(content, dict) or not all(isinstance(hashes, dict) for hashes in content.values()):
         return False
     hashes = {name: found for hashes in content.values() for name, found in hashes.items()}

@@ -3,9 +3,11 @@
 from collections.abc import Iterable
 from concurrent import futures
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mjx_walk.storage import checkpoint
+from mjx_walk.storage.checkpoint_metadata import Metadata
+from mjx_walk.utils.types import PyTree
 
 __all__ = ["BackgroundSaver", "Part"]
 
@@ -14,8 +16,8 @@ class Part(NamedTuple):
     """Arguments of `checkpoint.save` for one folder."""
 
     path: Path
-    tree: Any
-    metadata: dict[str, Any]
+    tree: PyTree
+    metadata: Metadata
 
 
 class BackgroundSaver:

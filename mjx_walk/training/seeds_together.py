@@ -6,10 +6,10 @@ A process that is killed while it saves leaves some of its seeds one checkpoint 
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from mjx_walk.algos import TrainState
 from mjx_walk.storage.checkpoint import list_steps, read_meta
+from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.training.distributed_checkpoint import SEEDS_TOGETHER
 from mjx_walk.training.recorder import Recorder
@@ -35,7 +35,7 @@ def have_saved(folders: list[RunFolder]) -> bool:
     raise _different_steps(int(own[-1].name) if own else 0 for own in saved)
 
 
-def restore_together(recorders: list[Recorder], like: TrainState) -> list[tuple[TrainState, dict[str, Any]]]:
+def restore_together(recorders: list[Recorder], like: TrainState) -> list[tuple[TrainState, Metadata]]:
     """The newest saved state and its metadata of each run, all at the same step.
 
     Args:

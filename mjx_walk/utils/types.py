@@ -8,6 +8,7 @@ from typing import Any, TypeAlias, TypeVar
 import flax
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.types import Transition
 from jax import Array
@@ -18,6 +19,7 @@ __all__ = [
     "PER_DEVICE",
     "RANDOM_KEY",
     "REPLAY",
+    "Act",
     "Metric",
     "Metrics",
     "Params",
@@ -42,6 +44,9 @@ PolicyParams: TypeAlias = tuple[RunningStatisticsState, Params]
 
 PolicyFn = Callable[[Float[Array, "B observation_size"], PRNGKeyArray], Float[Array, "B action_size"]]
 """`(obs, key) → action`, in Gymnasium's units on both sides."""
+
+Act = Callable[[Float[Array | np.ndarray, "*batch observation_size"]], Float[Array, "*batch action_size"]]
+"""`obs → action` of a deterministic policy, in Gymnasium's units, for one environment or a batch."""
 
 _Tree = TypeVar("_Tree")
 

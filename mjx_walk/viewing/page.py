@@ -6,7 +6,6 @@ import json
 import re
 import string
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -68,7 +67,7 @@ def write_page(episode: Episode, path: Path) -> Path:
     return path
 
 
-def _camera(episode: Episode) -> dict[str, Any]:
+def _camera(episode: Episode) -> dict[str, object]:
     """The point that stays in the middle of the page, and the camera's place relative to it.
 
     The point moves with the body if the view follows it; then it is at 0.6 of the body's greatest height. Places are in
@@ -101,7 +100,7 @@ def _body_poses(episode: Episode) -> np.ndarray:
     return poses
 
 
-def _geoms(model: mujoco.MjModel) -> list[dict[str, Any]]:
+def _geoms(model: mujoco.MjModel) -> list[dict[str, object]]:
     """The visible geoms, without planes, height fields and signed distance functions."""
     geoms = []
     for i in range(model.ngeom):
