@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.checkpoint_metadata import Metadata
-from mjx_walk.utils.types import PyTree
 
 __all__ = ["BackgroundSaver", "Part"]
 
@@ -16,7 +15,8 @@ class Part(NamedTuple):
     """Arguments of `checkpoint.save` for one folder."""
 
     path: Path
-    tree: PyTree
+    tree: object
+    """Pytree of arrays."""
     metadata: Metadata
 
 

@@ -21,7 +21,6 @@ from mjx_walk.storage.folders import discard, find_written, remove_unfinished, r
 from mjx_walk.storage.saved_yaml import MAX_BYTES
 from mjx_walk.storage.scores import POLICIES
 from mjx_walk.utils.errors import UnreadableError, UserError, failed_read
-from mjx_walk.utils.types import PyTree
 from mjx_walk.utils.versions import __version__
 
 _Tree = TypeVar("_Tree")
@@ -46,12 +45,12 @@ _RENAMED_LEAVES = {
 """Present paths of leaves, by the former paths in older checkpoints."""
 
 
-def to_host(tree: PyTree) -> HostArrays:
+def to_host(tree: object) -> HostArrays:
     """Copy a pytree to the host. The next program may then reuse its device memory."""
     return {name: np.array(leaf) for name, leaf in _named_leaves(jax.device_get(tree)).items()}
 
 
-def save(path: Path, tree: PyTree, meta: Metadata, as_numpy: bool = False, config: str | None = None) -> None:
+def save(path: Path, tree: object, meta: Metadata, as_numpy: bool = False, config: str | None = None) -> None:
     """Write a pytree of arrays. The folder gets its name only when it is complete.
 
     Args:
@@ -259,6 +258,6 @@ def _crc32(array: np.ndarray) -> int:
     return zlib.crc32(np.ascontiguousarray(array).view(np.uint8).data)
 
 
-def _named_leaves(tree: PyTree) -> dict[str, PyTree]:
+def _named_leaves(tree: object) -> dict[str, jax.Array]:
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
