@@ -17,6 +17,8 @@ from mjx_walk.envs.task import Task
 from mjx_walk.utils.setting_fields import setting
 from mjx_walk.utils.types import ITERATION_COUNT, Metric, Metrics, PolicyFn, PolicyParams, Reduction
 
+__all__ = ["NO_RETURN", "EvaluationConfig", "InlineEvaluation", "InlineEvaluator"]
+
 
 @dataclasses.dataclass
 class EvaluationConfig:

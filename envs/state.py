@@ -12,6 +12,17 @@ from numpy.typing import ArrayLike
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.utils.errors import UserError
 
+__all__ = [
+    "MAX_ABS_VALUE",
+    "NO_TIME_LIMIT",
+    "Carry",
+    "State",
+    "TrainableTask",
+    "check_action_shape",
+    "check_state_shape",
+    "is_finite",
+]
+
 NO_TIME_LIMIT = 2**31 - 1
 """Value of `max_episode_steps` when a caller or a wrapper applies the time limit."""
 

@@ -12,6 +12,8 @@ from mjx_walk.envs.user_files import absolute_source
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = ["MAX_FRAME_SKIP", "TaskOptions", "check_version", "with_absolute_paths"]
+
 MAX_FRAME_SKIP = 10_000
 """With more, the physics of one environment step takes minutes and cannot be interrupted."""
 

@@ -13,6 +13,8 @@ from jaxtyping import Bool, Float
 from mjx_walk.envs.physics.preparation import Preparation
 from mjx_walk.machine.compat import standard_dtypes
 
+__all__ = ["Derived", "Engine", "EngineFactory", "PhysicsState", "batch_once"]
+
 Derived = dict[str, Array]
 """MuJoCo arrays by their `mjData` names, for example `cinert`, `[nbody, 10] f32`."""
 

@@ -21,6 +21,8 @@ from mujoco.mjx.third_party import mujoco_warp
 
 from mjx_walk.storage.files import is_writable_folder, user_folder
 
+__all__ = ["Variants", "choose_cache", "launched_variants", "load_kernels"]
+
 _LOGGER = logging.getLogger("mjx_walk.progress")
 
 _SECONDS_BETWEEN_MESSAGES = 5.0

@@ -13,6 +13,7 @@ from mjx_walk.algos.policy_gradient import PolicyGradientAlgorithm, PolicyGradie
 from mjx_walk.common.brax_losses import PPOParams, compute_gae
 from mjx_walk.common.exploration import Exploration, NoExploration, OrnsteinUhlenbeck
 from mjx_walk.utils.setting_fields import AnyBut, setting
+from mjx_walk.utils.types import Losses
 
 __all__ = ["A2C", "A2CConfig"]
 
@@ -42,7 +43,7 @@ class A2C(PolicyGradientAlgorithm[A2CConfig]):
 
     def value_loss(
         self, params: PPOParams, normalizer: RunningStatisticsState, samples: Samples
-    ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    ) -> tuple[Float[Array, ""], Losses]:
         values = self.nets.value_network.apply(normalizer, params.value, samples.observation)
         loss = jnp.square(samples.target - values).mean()
         return self.config.value_loss_coef * loss, {"value_loss": loss}

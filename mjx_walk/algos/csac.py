@@ -13,12 +13,12 @@ from brax.training.networks import FeedForwardNetwork
 from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
-from mjx_walk.algos.off_policy import Batch, Losses
+from mjx_walk.algos.off_policy_state import Batch
 from mjx_walk.algos.sac import SAC, SACConfig, SACState
 from mjx_walk.common import networks
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
-from mjx_walk.utils.types import Params
+from mjx_walk.utils.types import Losses, Params
 
 __all__ = ["CSAC", "CSACConfig", "project"]
 

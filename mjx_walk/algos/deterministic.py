@@ -11,12 +11,13 @@ from brax.training.networks import FeedForwardNetwork
 from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
-from mjx_walk.algos.off_policy import Batch, Losses, OffPolicyAlgorithm
+from mjx_walk.algos.off_policy import OffPolicyAlgorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
+from mjx_walk.algos.off_policy_state import Batch
 from mjx_walk.common import networks
 from mjx_walk.common.optimizers import polyak_update
 from mjx_walk.utils.setting_fields import AnyBut, setting
-from mjx_walk.utils.types import Params
+from mjx_walk.utils.types import Losses, Params
 
 __all__ = ["DeterministicAlgorithm", "DeterministicConfig", "DeterministicState"]
 

@@ -4,9 +4,8 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Generic, TypeVar
 
-import flax
 import jax
 import jax.numpy as jnp
 import optax
@@ -15,65 +14,19 @@ from brax.training.acme.running_statistics import RunningStatisticsState
 from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
-from mjx_walk.algos.base import Algorithm, TrainState
+from mjx_walk.algos.base import Algorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
+from mjx_walk.algos.off_policy_state import Batch, LearnerT, OffPolicyState
 from mjx_walk.common import networks, returns, rollout
-from mjx_walk.common.optimizers import (
-    anneal_discount,
-    apply_gradients,
-    make_adam,
-    remaining_fraction,
-    schedule_factor,
-)
+from mjx_walk.common.optimizers import anneal_discount, apply_gradients, make_adam, remaining_fraction, schedule_factor
 from mjx_walk.common.replay_buffer import Replay, ReplayBuffer, Steps
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.types import RANDOM_KEY, REPLAY, Metrics, Params, PolicyFn, PolicyParams, Transition, as_means
+from mjx_walk.utils.types import Losses, Metrics, Params, PolicyFn, PolicyParams, as_means
 
-__all__ = ["Batch", "Learner", "Losses", "OffPolicyAlgorithm", "OffPolicyState"]
+__all__ = ["OffPolicyAlgorithm"]
 
-Losses = dict[str, Float[Array, ""]]
-"""Losses and other numbers of an update, by the names of their metrics."""
-
-
-class Batch(NamedTuple):
-    """Transitions to learn from, and the settings that change over a run."""
-
-    transitions: Transition
-    """`[N, …]`, see `ReplayBuffer.sample`; observations normalized, actions in `[-1, 1]`."""
-    reward_scale: Array
-    rate_factor: Array | float
-    """The factor of the learning rates."""
-    remaining: Array | float
-    """The fraction of `schedule_steps` that is left."""
-
-
-@runtime_checkable
-class Learner(Protocol):
-    """Networks and optimizers of an algorithm, of which the policy acts."""
-
-    @property
-    def policy(self) -> Params:
-        """Parameters of the policy."""
-        ...
-
-
-LearnerT = TypeVar("LearnerT", bound=Learner)
 OffPolicyConfigT = TypeVar("OffPolicyConfigT", bound=OffPolicyConfig)
 ParamsT = TypeVar("ParamsT")
-
-
-class OffPolicyState(TrainState, Generic[LearnerT]):
-    """State of an off-policy algorithm."""
-
-    learner: LearnerT
-    """Networks and optimizers."""
-    critic_updates: Array
-    """`[] i32`: critic updates so far."""
-    normalizer: RunningStatisticsState
-    return_scale: returns.ReturnScale
-    replay: Replay = flax.struct.field(metadata=REPLAY)
-    noise_key: Array = flax.struct.field(metadata=RANDOM_KEY)
-    """The exploration noise of every step follows from it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

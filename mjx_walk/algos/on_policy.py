@@ -28,7 +28,6 @@ from mjx_walk.utils.types import PER_DEVICE, Metrics, PolicyFn, PolicyParams, Tr
 __all__ = [
     "OnPolicyAlgorithm",
     "OnPolicyBatch",
-    "OnPolicyConfigT",
     "OnPolicyState",
     "require_several_gradient_steps",
 ]

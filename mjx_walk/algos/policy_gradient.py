@@ -13,15 +13,15 @@ from jaxtyping import Float, PRNGKeyArray
 from mjx_walk.algos.on_policy import (
     OnPolicyAlgorithm,
     OnPolicyBatch,
-    OnPolicyConfig,
     OnPolicyState,
     require_several_gradient_steps,
 )
+from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.common.brax_losses import PPOParams
 from mjx_walk.common.optimizers import schedule_factor
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
-from mjx_walk.utils.types import Metrics, as_means
+from mjx_walk.utils.types import Losses, Metrics, as_means
 
 __all__ = [
     "MAX_IMPORTANCE",
@@ -94,7 +94,7 @@ class PolicyGradientAlgorithm(OnPolicyAlgorithm[PolicyGradientConfigT]):
 
     def value_loss(
         self, params: PPOParams, normalizer: RunningStatisticsState, samples: Samples
-    ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    ) -> tuple[Float[Array, ""], Losses]:
         """The loss of the value network, and metrics; zero where there is none."""
         return jnp.float32(0.0), {}
 
@@ -141,7 +141,7 @@ class PolicyGradientAlgorithm(OnPolicyAlgorithm[PolicyGradientConfigT]):
         part: Samples,
         entropy_coef: Float[Array, ""] | float,
         key: PRNGKeyArray,
-    ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    ) -> tuple[Float[Array, ""], Losses]:
         """The loss of a minibatch, and metrics."""
         distribution = self.nets.parametric_action_distribution
         logits = self.nets.policy_network.apply(normalizer, params.policy, part.observation)

@@ -12,15 +12,15 @@ from jaxtyping import Float
 from mjx_walk.algos.on_policy import (
     OnPolicyAlgorithm,
     OnPolicyBatch,
-    OnPolicyConfig,
     OnPolicyState,
     require_several_gradient_steps,
 )
+from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.common.brax_losses import make_ppo_loss
 from mjx_walk.common.optimizers import schedule_factor
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
-from mjx_walk.utils.types import Metrics, as_means
+from mjx_walk.utils.types import Losses, Metrics, as_means
 
 __all__ = ["PPO", "PPOConfig"]
 
@@ -96,7 +96,7 @@ class PPO(OnPolicyAlgorithm[PPOConfig]):
 
 def _loss_metrics(
     metrics: dict[str, Float[Array, "epochs minibatches"]],
-) -> dict[str, Float[Array, ""]]:
+) -> Losses:
     """Means of Brax's metrics over all minibatches, under our names."""
     names = {
         "total_loss": "loss",

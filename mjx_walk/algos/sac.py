@@ -10,13 +10,14 @@ from brax.training.agents.sac.networks import SACNetworks
 from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
-from mjx_walk.algos.off_policy import Batch, Losses, OffPolicyAlgorithm
+from mjx_walk.algos.off_policy import OffPolicyAlgorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
+from mjx_walk.algos.off_policy_state import Batch
 from mjx_walk.common import networks
 from mjx_walk.common.brax_losses import SACLosses, make_sac_losses
 from mjx_walk.common.optimizers import polyak_update
 from mjx_walk.utils.setting_fields import AnyBut, setting
-from mjx_walk.utils.types import Params
+from mjx_walk.utils.types import Losses, Params
 
 __all__ = ["SAC", "SACConfig", "SACState"]
 

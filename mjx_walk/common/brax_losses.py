@@ -13,7 +13,7 @@ from brax.training.agents.sac.networks import SACNetworks
 from jax import Array
 from jaxtyping import Bool, Float
 
-from mjx_walk.utils.types import Transition
+from mjx_walk.utils.types import Losses, Transition
 
 __all__ = [
     "PPOLossConfig",
@@ -67,7 +67,7 @@ def on_policy_transition(
 
 def make_ppo_loss(
     nets: PPONetworks, config: PPOLossConfig, entropy_coef: Float[Array, ""] | float, reward_scale: Float[Array, ""]
-) -> Callable[..., tuple[Float[Array, ""], dict[str, Float[Array, ""]]]]:
+) -> Callable[..., tuple[Float[Array, ""], Losses]]:
     """`(params, normalizer, transitions [N, T, …], key) → (loss, metrics)`.
 
     Args:

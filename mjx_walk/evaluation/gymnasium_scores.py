@@ -22,6 +22,8 @@ from mjx_walk.storage.scores import Scores
 from mjx_walk.utils.setting_fields import MAX_SEED, setting
 from mjx_walk.utils.types import Act, PolicyFn
 
+__all__ = ["Episodes", "ScoreRequest", "compile_episodes", "score_in_gymnasium", "score_in_sim"]
+
 _MAX_PARALLEL_EPISODES = 1024
 """Episodes played at once; an environment takes about 1 MB."""
 

@@ -15,6 +15,8 @@ import numpy as np
 
 from mjx_walk.machine.streams import open_standard_streams
 
+__all__ = ["send", "serve"]
+
 _STDOUT, _STDERR = 1, 2
 
 

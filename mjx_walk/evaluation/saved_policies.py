@@ -27,10 +27,12 @@ from mjx_walk.utils.types import Act, PolicyFn, PolicyParams
 __all__ = [
     "SavedPolicy",
     "best_policy",
+    "choose_policy",
     "default_policy",
     "deterministic_act",
     "deterministic_policy",
     "kept_policies",
+    "load_policy",
     "make_acting_algorithm",
     "make_task",
 ]

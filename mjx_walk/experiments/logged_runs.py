@@ -16,6 +16,8 @@ from mjx_walk.storage.run_folder import RunFolder, open_existing
 from mjx_walk.storage.scores import BEST, BETTER, ScoreBlock, ScoreFile, read_scores
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["MIN_SEEDS_FOR_INTERVALS", "MIN_SEEDS_FOR_IQM", "LoggedRun", "group", "interval", "mean_curve", "read_runs"]
+
 MIN_SEEDS_FOR_INTERVALS = 3
 MIN_SEEDS_FOR_IQM = 10
 _POINTS = 200

@@ -20,6 +20,8 @@ from mjx_walk.experiments.timing import Measurement
 from mjx_walk.training.programs import make_init, make_step
 from mjx_walk.utils.types import PyTree
 
+__all__ = ["BraxTask", "brax_ppo_speed", "brax_sac_speed", "measure", "restore_device_put_replicated", "sac_speed"]
+
 _UNROLL_LENGTH = 10
 _EPISODE_LENGTH = 1000
 _SAC_SIZES: dict[str, dict[str, Any]] = {

@@ -25,6 +25,8 @@ from mjx_walk.training.programs import make_init, make_step
 from mjx_walk.utils.types import Metrics, PyTree, as_means
 from mjx_walk.viewing.episode import make_gymnasium
 
+__all__ = ["matmul_speed", "measure", "time_parts"]
+
 _STEPS_PER_CALL = 25
 """About as long as a random policy keeps a humanoid upright. Every call starts from resets, like real episodes."""
 

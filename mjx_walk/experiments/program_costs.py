@@ -12,6 +12,8 @@ from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.types import PyTree
 
+__all__ = ["learning_flops", "matmul_flops", "reduced_bytes"]
+
 _REDUCTIONS = ("psum", "pmax", "all_gather")
 
 

@@ -14,6 +14,8 @@ from mjx_walk.storage.scores import BEST, FINAL
 from mjx_walk.utils.text import format_score, in_markdown
 from mjx_walk.viewing.run_plots import evaluations, learning_axes, series
 
+__all__ = ["DRAWN", "LEGEND", "csv_row", "draw_curves", "run_cells", "table", "write_comparison"]
+
 DRAWN = (
     "Lines: with exploration noise, each seed thin, their mean bold. Dots: evaluations without noise. "
     "Stars: final policies in Gymnasium."

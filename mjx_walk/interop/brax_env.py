@@ -19,6 +19,8 @@ from mjx_walk.envs.state import check_action_shape
 from mjx_walk.machine.compat import standard_dtypes
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["BraxEnv"]
+
 _MODEL_ARRAYS = {field.name for field in dataclasses.fields(mjx.Model)}
 _INSTEAD = {
     "gravity": "opt.gravity",

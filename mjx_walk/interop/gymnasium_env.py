@@ -22,6 +22,8 @@ from mjx_walk.interop.mujoco_attributes import (
     split_keywords,
 )
 
+__all__ = ["MjxWalkEnv"]
+
 _NOT_PICKLED = ("_gymnasium_env", "_snapshot", "_programs")
 
 

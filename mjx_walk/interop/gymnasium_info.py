@@ -5,6 +5,8 @@ from collections.abc import Mapping
 import jax
 import numpy as np
 
+__all__ = ["FLAGS", "add_flags", "add_info", "single_info"]
+
 FLAGS = ("nonfinite", "overflow")
 """Metrics that `info` holds, as 1.0, only where they are set."""
 

@@ -16,6 +16,8 @@ from mjx_walk.envs.info import Info
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.machine.compat import prepare_jax
 
+__all__ = ["Programs", "is_forked", "make_programs", "refuse_fork"]
+
 _process_of_jax: list[int] = []
 """Id of the process in which this module first used JAX."""
 

@@ -12,6 +12,8 @@ from mjx_walk.interop.mujoco_attributes import MujocoAttributes
 if TYPE_CHECKING:
     from mjx_walk.interop.gymnasium_vector_env import MjxWalkVectorEnv
 
+__all__ = ["SubEnv"]
+
 
 class SubEnv(MujocoAttributes):
     """One environment of `MjxWalkVectorEnv`, as `get_attr`, `set_attr`, `call` and `render` see it."""

@@ -21,6 +21,8 @@ from mjx_walk.interop.mujoco_attributes import RENDER_MODES, make_gymnasium_env,
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.value_types import type_problem
 
+__all__ = ["MjxWalkVectorEnv"]
+
 _NOT_PICKLED = ("_gymnasium_env", "_snapshot", "_init", "_programs", "envs")
 
 

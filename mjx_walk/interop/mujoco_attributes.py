@@ -18,6 +18,8 @@ from mjx_walk.machine.opengl import has_screen
 from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["RENDER_KEYWORDS", "RENDER_MODES", "MujocoAttributes", "make_gymnasium_env", "split_keywords"]
+
 RENDER_KEYWORDS = (
     "render_mode",
     "width",

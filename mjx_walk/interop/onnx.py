@@ -16,6 +16,8 @@ from onnx import TensorProto, helper, numpy_helper
 
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["DTYPES", "Value", "translate"]
+
 _OPSET = 17
 _UNARY = ("abs", "erf", "exp", "log", "neg", "not", "sign", "sqrt", "tanh")
 _BINARY = ("add", "div", "max", "min", "mul", "pow", "sub")

@@ -13,7 +13,7 @@ from mjx_walk.storage.files import open_to_read, replacing
 from mjx_walk.utils.errors import UserError, failed_read
 from mjx_walk.utils.types import Metrics, Reduction
 
-__all__ = ["Row", "name_metrics", "physics_warnings", "read_rows", "write_csv"]
+__all__ = ["Row", "mean_row", "name_metrics", "physics_warnings", "read_rows", "write_csv"]
 
 Row = dict[str, float]
 """One line of `metrics.jsonl`. `name_metrics` lists the names."""

@@ -8,6 +8,8 @@ import jax
 from mjx_walk.machine.subprocesses import python
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["count_devices", "default_backend", "default_device", "device_memory", "num_bytes", "only_device"]
+
 
 def default_backend() -> str:
     """Name of JAX's default backend, such as `cpu` or `gpu`.

@@ -16,7 +16,15 @@ from mjx_walk.storage.files import read_bytes, write_text
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["changed_input", "check_inputs", "check_model", "read_inputs", "save_inputs", "warn_of_changed_inputs"]
+__all__ = [
+    "Inputs",
+    "changed_input",
+    "check_inputs",
+    "check_model",
+    "read_inputs",
+    "save_inputs",
+    "warn_of_changed_inputs",
+]
 
 _MODEL, _REWARD, _TASK = "env.xml_file", "env.reward_function", "env.task"
 _MAX_BYTES = 10_000_000

@@ -14,7 +14,7 @@ from mjx_walk.envs.user_files import changed_file, only_known, source_path
 from mjx_walk.storage.files import user_folder, write_text
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["remember", "require_trusted", "trust_file"]
+__all__ = ["Trusted", "remember", "require_trusted", "trust_file"]
 
 _LOGGER = logging.getLogger(__name__)
 

@@ -37,7 +37,7 @@ _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 class ShapeAndDtype(Protocol):
-    """What arrays and `jax.ShapeDtypeStruct`s have in common."""
+    """An array, or a `jax.ShapeDtypeStruct`."""
 
     @property
     def shape(self) -> tuple[int, ...]: ...

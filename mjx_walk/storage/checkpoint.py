@@ -23,6 +23,21 @@ from mjx_walk.storage.scores import POLICIES
 from mjx_walk.utils.errors import UnreadableError, UserError, failed_read
 from mjx_walk.utils.versions import __version__
 
+__all__ = [
+    "config_copy",
+    "discard_from",
+    "find",
+    "list_steps",
+    "present_name",
+    "prune",
+    "read_meta",
+    "restore",
+    "restore_newest",
+    "save",
+    "step_path",
+    "to_host",
+]
+
 _Tree = TypeVar("_Tree")
 
 _META = "meta.json"

@@ -12,6 +12,8 @@ from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.training.distributed import Processes
 from mjx_walk.utils.types import map_leaves_with
 
+__all__ = ["NUM_DEVICES", "SEEDS_TOGETHER", "device_folder", "restore_newest"]
+
 NUM_DEVICES: Final = "num_devices"
 """Key of a checkpoint's metadata: the number of devices that saved it."""
 SEEDS_TOGETHER: Final = "seeds_together"

@@ -25,6 +25,8 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import PolicyParams
 from mjx_walk.viewing.film import Filmer
 
+__all__ = ["Recorder"]
+
 _LOGGER = logging.getLogger(__name__)
 
 

@@ -20,6 +20,7 @@ __all__ = [
     "RANDOM_KEY",
     "REPLAY",
     "Act",
+    "Losses",
     "Metric",
     "Metrics",
     "Params",
@@ -85,7 +86,11 @@ Metrics = dict[str, Metric]
 """Metrics by the names under which they are logged."""
 
 
-def as_means(values: dict[str, jax.Array]) -> Metrics:
+Losses = dict[str, Float[Array, ""]]
+"""Losses and other numbers of one update, by the names of their metrics."""
+
+
+def as_means(values: Losses) -> Metrics:
     """Metrics that are means over iterations."""
     return {name: Metric(value, Reduction.MEAN) for name, value in values.items()}
 

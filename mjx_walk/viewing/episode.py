@@ -17,6 +17,8 @@ from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.viewing.rendering import choose_opengl
 from mjx_walk.viewing.task_env import TaskEnv
 
+__all__ = ["Episode", "camera_settings", "make_gymnasium", "record_episode"]
+
 _FLOOR_SCALE = 20.0
 """MuJoCo draws a plane only as large as its `size`; a fast runner leaves it after 3 seconds."""
 

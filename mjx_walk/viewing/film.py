@@ -23,6 +23,8 @@ from mjx_walk.utils.types import PolicyParams
 from mjx_walk.viewing.episode import record_episode
 from mjx_walk.viewing.rendering import write_film
 
+__all__ = ["Filmer", "film"]
+
 _SIZE = (320, 240)
 _FRAMES_PER_SECOND = 25.0
 _SECONDS_IN_TENSORBOARD = 5.0

@@ -16,6 +16,8 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.text import format_score
 from mjx_walk.viewing.episode import Episode
 
+__all__ = ["require_library", "write_page"]
+
 _TEMPLATE = Path(__file__).with_name("page.html")
 _SHAPES = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 """Shapes that the page can draw."""

@@ -10,6 +10,8 @@ from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
 from mjx_walk.envs import State, Task
 
+__all__ = ["TaskEnv"]
+
 
 class TaskEnv(gymnasium.Env):
     """Steps a task, and copies its physics state to `data`. It has the attributes of Gymnasium's `MujocoEnv`."""

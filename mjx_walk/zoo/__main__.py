@@ -16,6 +16,8 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
 from mjx_walk.utils.types import PolicyParams
 
+__all__ = ["USAGE", "Arguments", "main"]
+
 USAGE = """
 usage: python -m mjx_walk.zoo
        python -m mjx_walk.zoo add=RUN_DIR name=NAME [num_runs=1 runs_mean=SCORE]
