@@ -4,7 +4,7 @@ Importing the package registers the tasks with Gymnasium and does nothing else.
 """
 
 import importlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mjx_walk.interop.registration import register
 from mjx_walk.machine.opengl import import_mujoco
@@ -39,7 +39,7 @@ _WHERE = {
 }
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
     """Import JAX and MuJoCo at the first use of a name that needs them."""
     if name in _WHERE:
         return getattr(importlib.import_module(_WHERE[name]), name)

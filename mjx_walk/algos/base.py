@@ -45,9 +45,9 @@ class AlgorithmConfig(Protocol):
     """Start the first episodes at random step counts."""
 
 
-StateT = TypeVar("StateT", bound=TrainState)
-BatchT = TypeVar("BatchT")
-ConfigT = TypeVar("ConfigT", bound=AlgorithmConfig)
+_StateT = TypeVar("_StateT", bound=TrainState)
+_BatchT = TypeVar("_BatchT")
+_ConfigT = TypeVar("_ConfigT", bound=AlgorithmConfig)
 
 
 def learned_leaves(state: TrainState) -> dict[str, Array]:
@@ -69,14 +69,14 @@ def is_finite(state: TrainState) -> Bool[Array, ""]:
     return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in learned_leaves(state).values()]))
 
 
-def without_replay(state: StateT) -> StateT:
+def without_replay(state: _StateT) -> _StateT:
     """A TrainState, or its shapes, without the replay buffer."""
     fields = {field.name: () for field in dataclasses.fields(state) if field.metadata.get("replay")}
     return state.replace(**fields)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Algorithm(abc.ABC, Generic[StateT, BatchT, ConfigT]):
+class Algorithm(abc.ABC, Generic[_StateT, _BatchT, _ConfigT]):
     """A learning algorithm for one task, as pure functions of its state.
 
     `Algorithm[State, Batch, Config]`: its `TrainState`, what `collect` passes to `learn`, and its settings.
@@ -91,7 +91,7 @@ class Algorithm(abc.ABC, Generic[StateT, BatchT, ConfigT]):
     """Environments that train, B."""
     evaluation: EvaluationConfig
     """Settings of the inline evaluation."""
-    config: ConfigT
+    config: _ConfigT
     """Settings of the algorithm, copied."""
     axis_name: str | None = None
     """Mapped axis over devices in `learn`, if several devices train one run."""
@@ -120,7 +120,7 @@ class Algorithm(abc.ABC, Generic[StateT, BatchT, ConfigT]):
         """Memory of the replay, if there is one."""
         return 0
 
-    def start_iteration(self, state: StateT, pool_key: PRNGKeyArray) -> tuple[VectorState, InlineEvaluation, Metrics]:
+    def start_iteration(self, state: _StateT, pool_key: PRNGKeyArray) -> tuple[VectorState, InlineEvaluation, Metrics]:
         """Renew the pool of random starts, and start the next evaluation round if one has ended.
 
         Returns:
@@ -132,25 +132,25 @@ class Algorithm(abc.ABC, Generic[StateT, BatchT, ConfigT]):
         )
         return env, evaluation, scores
 
-    def state_shapes(self) -> StateT:
+    def state_shapes(self) -> _StateT:
         """Shapes and dtypes of the state, without running anything."""
         with nothing_runs():
             return jax.eval_shape(self.init, jax.random.PRNGKey(0))
 
     @abc.abstractmethod
-    def init(self, key: PRNGKeyArray) -> StateT:
+    def init(self, key: PRNGKeyArray) -> _StateT:
         """The state before the first iteration."""
 
     @abc.abstractmethod
-    def collect(self, state: StateT) -> tuple[StateT, BatchT]:
+    def collect(self, state: _StateT) -> tuple[_StateT, _BatchT]:
         """Act and step all environments: `state → (state, batch)`."""
 
     @abc.abstractmethod
-    def learn(self, state: StateT, batch: BatchT) -> tuple[StateT, Metrics]:
+    def learn(self, state: _StateT, batch: _BatchT) -> tuple[_StateT, Metrics]:
         """Gradient steps on the batch: `(state, batch) → (state, metrics)`."""
 
     @abc.abstractmethod
-    def policy_params(self, state: StateT) -> PolicyParams:
+    def policy_params(self, state: _StateT) -> PolicyParams:
         """The part of the state that the policy needs, small enough to ship."""
 
     @abc.abstractmethod

@@ -53,11 +53,11 @@ class DeterministicState(flax.struct.PyTreeNode):
     critic_optimizer: optax.OptState
 
 
-DeterministicConfigT = TypeVar("DeterministicConfigT", bound=DeterministicConfig)
+_DeterministicConfigT = TypeVar("_DeterministicConfigT", bound=DeterministicConfig)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class DeterministicAlgorithm(OffPolicyAlgorithm[DeterministicState, DeterministicConfigT]):
+class DeterministicAlgorithm(OffPolicyAlgorithm[DeterministicState, _DeterministicConfigT]):
     """A deterministic policy, and critics whose minimum is the target.
 
     Source: Fujimoto et al. 2018, algorithm 1: both targets move when the policy does.

@@ -25,13 +25,13 @@ from mjx_walk.utils.types import Losses, Metrics, Params, PolicyFn, PolicyParams
 
 __all__ = ["OffPolicyAlgorithm"]
 
-OffPolicyConfigT = TypeVar("OffPolicyConfigT", bound=OffPolicyConfig)
-ParamsT = TypeVar("ParamsT")
+_OffPolicyConfigT = TypeVar("_OffPolicyConfigT", bound=OffPolicyConfig)
+_ParamsT = TypeVar("_ParamsT")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OffPolicyAlgorithm(
-    Algorithm[OffPolicyState[LearnerT], tuple[Steps, Metrics], OffPolicyConfigT], Generic[LearnerT, OffPolicyConfigT]
+    Algorithm[OffPolicyState[LearnerT], tuple[Steps, Metrics], _OffPolicyConfigT], Generic[LearnerT, _OffPolicyConfigT]
 ):
     """Stores steps in a replay and learns from samples of it. Subclasses define networks, losses and updates.
 
@@ -112,8 +112,8 @@ class OffPolicyAlgorithm(
         return self.buffer.num_bytes
 
     def apply_gradients(
-        self, params: ParamsT, grads: ParamsT, optimizer: optax.OptState, rate: Float[Array, ""] | float
-    ) -> tuple[ParamsT, optax.OptState]:
+        self, params: _ParamsT, grads: _ParamsT, optimizer: optax.OptState, rate: Float[Array, ""] | float
+    ) -> tuple[_ParamsT, optax.OptState]:
         """One gradient step: parameters and optimizer state after it."""
         return apply_gradients(self.optimizer, params, grads, optimizer, rate, self.axis_name)
 

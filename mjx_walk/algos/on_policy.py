@@ -32,7 +32,7 @@ __all__ = [
     "require_several_gradient_steps",
 ]
 
-OnPolicyConfigT = TypeVar("OnPolicyConfigT", bound=OnPolicyConfig)
+_OnPolicyConfigT = TypeVar("_OnPolicyConfigT", bound=OnPolicyConfig)
 
 
 class OnPolicyState(TrainState):
@@ -63,7 +63,7 @@ class OnPolicyBatch(flax.struct.PyTreeNode):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class OnPolicyAlgorithm(Algorithm[OnPolicyState, OnPolicyBatch, OnPolicyConfigT]):
+class OnPolicyAlgorithm(Algorithm[OnPolicyState, OnPolicyBatch, _OnPolicyConfigT]):
     """Collects unrolls of the present policy. Subclasses define `update`.
 
     The first batches only measure the scale of observations and rewards. Without that scale the policy that learns

@@ -65,11 +65,11 @@ class Samples(NamedTuple):
     """Target of the value network; empty where there is none."""
 
 
-PolicyGradientConfigT = TypeVar("PolicyGradientConfigT", bound=PolicyGradientConfig)
+_PolicyGradientConfigT = TypeVar("_PolicyGradientConfigT", bound=PolicyGradientConfig)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class PolicyGradientAlgorithm(OnPolicyAlgorithm[PolicyGradientConfigT]):
+class PolicyGradientAlgorithm(OnPolicyAlgorithm[_PolicyGradientConfigT]):
     """Uses each step of a batch for one gradient step. Subclasses define `samples`.
 
     Raises:

@@ -10,19 +10,19 @@ from jaxtyping import Float, PRNGKeyArray
 
 __all__ = ["Exploration", "NoExploration", "OrnsteinUhlenbeck"]
 
-NoiseT = TypeVar("NoiseT")
+_NoiseT = TypeVar("_NoiseT")
 
 
-class Exploration(Protocol[NoiseT]):
+class Exploration(Protocol[_NoiseT]):
     """Noise for unrolls of T steps, added to actions in `[-1, 1]`."""
 
-    def init(self, num_envs: int, action_size: int) -> NoiseT:
+    def init(self, num_envs: int, action_size: int) -> _NoiseT:
         """The state of the noise before the first step."""
         ...
 
     def unroll(
-        self, state: NoiseT, key: PRNGKeyArray, num_steps: int
-    ) -> tuple[NoiseT, Float[Array, "T B action_size"] | Float[Array, " T"], PRNGKeyArray]:
+        self, state: _NoiseT, key: PRNGKeyArray, num_steps: int
+    ) -> tuple[_NoiseT, Float[Array, "T B action_size"] | Float[Array, " T"], PRNGKeyArray]:
         """The noise of T steps.
 
         Returns:

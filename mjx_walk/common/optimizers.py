@@ -21,7 +21,7 @@ __all__ = [
     "schedule_factor",
 ]
 
-ParamsT = TypeVar("ParamsT")
+_ParamsT = TypeVar("_ParamsT")
 
 
 def make_adam(max_grad_norm: float | None = None) -> optax.GradientTransformation:
@@ -33,12 +33,12 @@ def make_adam(max_grad_norm: float | None = None) -> optax.GradientTransformatio
 
 def apply_gradients(
     optimizer: optax.GradientTransformation,
-    params: ParamsT,
-    grads: ParamsT,
+    params: _ParamsT,
+    grads: _ParamsT,
     state: optax.OptState,
     learning_rate: PyTree,
     axis_name: str | None,
-) -> tuple[ParamsT, optax.OptState]:
+) -> tuple[_ParamsT, optax.OptState]:
     """One gradient step.
 
     Args:
@@ -57,7 +57,7 @@ def apply_gradients(
     return optax.apply_updates(params, steps), state
 
 
-def polyak_update(target: ParamsT, params: ParamsT, tau: float) -> ParamsT:
+def polyak_update(target: _ParamsT, params: _ParamsT, tau: float) -> _ParamsT:
     """`(1 − τ) target + τ params`."""
     return jax.tree.map(lambda t, p: (1.0 - tau) * t + tau * p, target, params)
 

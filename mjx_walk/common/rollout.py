@@ -15,11 +15,11 @@ from mjx_walk.utils.types import Metrics, PolicyFn, PyTree
 
 __all__ = ["Actor", "Step", "evaluate", "unroll"]
 
-InputsT = TypeVar("InputsT")
-ExtrasT = TypeVar("ExtrasT")
-KeptT = TypeVar("KeptT")
+_InputsT = TypeVar("_InputsT")
+_ExtrasT = TypeVar("_ExtrasT")
+_KeptT = TypeVar("_KeptT")
 
-Actor = Callable[[Float[Array, "B observation_size"], InputsT], tuple[Float[Array, "B action_size"], ExtrasT]]
+Actor = Callable[[Float[Array, "B observation_size"], _InputsT], tuple[Float[Array, "B action_size"], _ExtrasT]]
 """`(obs, inputs of the step) → (action in Gymnasium's units, extras)`."""
 
 
@@ -37,10 +37,10 @@ def unroll(
     env: VectorEnv,
     state: VectorState,
     evaluation: InlineEvaluation,
-    actor: Actor[InputsT, ExtrasT],
-    inputs: InputsT,
-    keep: Callable[[Step], KeptT],
-) -> tuple[VectorState, InlineEvaluation, KeptT, Metrics]:
+    actor: Actor[_InputsT, _ExtrasT],
+    inputs: _InputsT,
+    keep: Callable[[Step], _KeptT],
+) -> tuple[VectorState, InlineEvaluation, _KeptT, Metrics]:
     """Step all environments T times.
 
     Args:

@@ -59,10 +59,10 @@ def measure(config: Config, task: Task, seconds: float) -> Iterator[Measurement]
         yield from _insert_times(task)
 
 
-Carry = TypeVar("Carry")
+_Carry = TypeVar("_Carry")
 
 
-def _seconds_per_call(advance: Callable[[Carry], Carry], carry: Carry, seconds: float) -> tuple[Carry, float]:
+def _seconds_per_call(advance: Callable[[_Carry], _Carry], carry: _Carry, seconds: float) -> tuple[_Carry, float]:
     """The carry after repeated calls of `carry → carry`, and seconds per call without the first one, which compiles."""
     carry = jax.block_until_ready(advance(carry))
     start, calls = time.monotonic(), 0

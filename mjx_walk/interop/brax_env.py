@@ -185,6 +185,6 @@ def _check_switches(changes: dict[str, jax.Array], model: mujoco.MjModel) -> Non
             raise UserError(f"the model has no {' or '.join(group)}, so MJX does not read '{name}'; give it a value")
 
 
-def _dotted(path: tuple[object, ...]) -> str:
+def _dotted(path: jax.tree_util.KeyPath) -> str:
     """Path of a leaf as `tree_replace` takes it, such as `opt.gravity`."""
     return jax.tree_util.keystr(path, simple=True, separator=".")

@@ -1,10 +1,11 @@
 """One environment of the vector environment, for code that asks for its attributes."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import jax
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from mjx_walk.envs import State
 from mjx_walk.interop.mujoco_attributes import MujocoAttributes
@@ -35,7 +36,7 @@ class SubEnv(MujocoAttributes):
         return {name: value for name, value in self._vector_env.metadata.items() if name != "autoreset_mode"}
 
     @property
-    def spec(self) -> object:
+    def spec(self) -> EnvSpec | None:
         return self._vector_env.spec
 
     @property
@@ -55,7 +56,7 @@ class SubEnv(MujocoAttributes):
         """Itself: no wrapper is around one environment."""
         return self
 
-    def get_wrapper_attr(self, name: str) -> object:
+    def get_wrapper_attr(self, name: str) -> Any:
         """An attribute, as `gymnasium.Env.get_wrapper_attr` finds it."""
         return getattr(self, name)
 

@@ -182,12 +182,12 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         """A frame of each environment."""
         return tuple(env.render() for env in self.envs)
 
-    def call(self, name: str, *args: object, **kwargs: object) -> tuple[object, ...]:
+    def call(self, name: str, *args: object, **kwargs: object) -> tuple[Any, ...]:
         """Results of a method of each environment, or values of an attribute; see `SubEnv`."""
         found = [getattr(env, name) for env in self.envs]
         return tuple(value(*args, **kwargs) if callable(value) else value for value in found)
 
-    def get_attr(self, name: str) -> tuple[object, ...]:
+    def get_attr(self, name: str) -> tuple[Any, ...]:
         """Values of an attribute of each environment."""
         return self.call(name)
 

@@ -61,36 +61,36 @@ def own_hydra() -> Iterator[ConfigStore]:
                 BaseContainer._resolvers = resolvers
 
 
-K = TypeVar("K")
-V = TypeVar("V")
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
 
 
-class _OwnInOneThread(MutableMapping[K, V]):
+class _OwnInOneThread(MutableMapping[_Key, _Value]):
     """A dictionary that is another one in the thread that makes it."""
 
-    def __init__(self, everyones: dict[K, V], own: dict[K, V]):
+    def __init__(self, everyones: dict[_Key, _Value], own: dict[_Key, _Value]):
         self._everyones, self._own, self._owner = everyones, own, threading.get_ident()
 
     @property
-    def _present(self) -> dict[K, V]:
+    def _present(self) -> dict[_Key, _Value]:
         return self._own if threading.get_ident() == self._owner else self._everyones
 
-    def __getitem__(self, key: K) -> V:
+    def __getitem__(self, key: _Key) -> _Value:
         return self._present[key]
 
-    def __setitem__(self, key: K, value: V) -> None:
+    def __setitem__(self, key: _Key, value: _Value) -> None:
         self._present[key] = value
 
-    def __delitem__(self, key: K) -> None:
+    def __delitem__(self, key: _Key) -> None:
         del self._present[key]
 
-    def __iter__(self) -> Iterator[K]:
+    def __iter__(self) -> Iterator[_Key]:
         return iter(self._present)
 
     def __len__(self) -> int:
         return len(self._present)
 
-    def __deepcopy__(self, memo: dict[int, object]) -> dict[K, V]:
+    def __deepcopy__(self, memo: dict[int, object]) -> dict[_Key, _Value]:
         return copy.deepcopy(self._present, memo)
 
 

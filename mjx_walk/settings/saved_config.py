@@ -192,10 +192,10 @@ def name_same_file(old: object, new: object) -> bool:
     return isinstance(old, str) and isinstance(new, str) and Path(old).name == Path(new).name
 
 
-Settings = TypeVar("Settings", bound="DataclassInstance")
+_Settings = TypeVar("_Settings", bound="DataclassInstance")
 
 
-def with_setting(settings: Settings, key: str, value: object) -> Settings:
+def with_setting(settings: _Settings, key: str, value: object) -> _Settings:
     """Replace a value of nested dataclasses by its key, such as `evaluation.films`."""
     name, _, rest = key.partition(".")
     own = with_setting(getattr(settings, name), rest, value) if rest else value
