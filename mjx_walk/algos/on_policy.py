@@ -25,12 +25,7 @@ from mjx_walk.utils import collectives
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import PER_DEVICE, Metrics, PolicyFn, PolicyParams, Transition
 
-__all__ = [
-    "OnPolicyAlgorithm",
-    "OnPolicyBatch",
-    "OnPolicyState",
-    "require_several_gradient_steps",
-]
+__all__ = ["OnPolicyAlgorithm", "OnPolicyBatch", "OnPolicyState", "require_several_gradient_steps"]
 
 _OnPolicyConfigT = TypeVar("_OnPolicyConfigT", bound=OnPolicyConfig)
 

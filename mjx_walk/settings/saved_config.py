@@ -4,7 +4,7 @@ import dataclasses
 import operator
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -19,9 +19,7 @@ from mjx_walk.storage.files import write_text
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.saved_yaml import read_yaml
 from mjx_walk.utils.errors import UserError, first_line
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
+from mjx_walk.utils.setting_fields import Dataclass
 
 __all__ = [
     "MAY_DIFFER",
@@ -192,7 +190,7 @@ def name_same_file(old: object, new: object) -> bool:
     return isinstance(old, str) and isinstance(new, str) and Path(old).name == Path(new).name
 
 
-_Settings = TypeVar("_Settings", bound="DataclassInstance")
+_Settings = TypeVar("_Settings", bound=Dataclass)
 
 
 def with_setting(settings: _Settings, key: str, value: object) -> _Settings:

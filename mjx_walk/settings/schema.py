@@ -9,10 +9,7 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import ENGINES
-from mjx_walk.utils.setting_fields import MAX_SEED, setting
-
-if typing.TYPE_CHECKING:
-    from _typeshed import DataclassInstance
+from mjx_walk.utils.setting_fields import MAX_SEED, Dataclass, setting
 
 __all__ = ["CheckpointConfig", "Config", "chosen", "setting_types"]
 
@@ -85,9 +82,7 @@ def setting_types(env: str, algo: str) -> dict[str, object]:
     return dict(_walk(Config, "", {"env": TASKS[env][1], "algo": ALGORITHMS[algo][1]}))
 
 
-def _walk(
-    schema: "DataclassInstance | type[DataclassInstance]", prefix: str, groups: Mapping[str, type]
-) -> Iterator[tuple[str, object]]:
+def _walk(schema: Dataclass | type[Dataclass], prefix: str, groups: Mapping[str, type]) -> Iterator[tuple[str, object]]:
     hints = typing.get_type_hints(schema)
     for field in dataclasses.fields(schema):
         key = prefix + field.name

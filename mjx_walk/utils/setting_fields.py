@@ -7,17 +7,15 @@ import math
 import textwrap
 import typing
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.value_types import type_problem
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
 __all__ = [
     "MAX_SEED",
     "AnyBut",
+    "Dataclass",
     "Row",
     "describe",
     "has_effect",
@@ -38,6 +36,12 @@ _MAX_ITEMS = 100
 """Values that a list may have. Each layer of a network takes its time to compile."""
 _MAX_INT = 10**12
 """No count is larger. JAX cannot hold shapes from 2**63 elements on, and some of its errors end the process."""
+
+
+class Dataclass(Protocol):
+    """An object of any dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
 
 
 class AnyBut(NamedTuple):
@@ -84,7 +88,7 @@ def with_name(schema: type[Schema], name: str) -> type[Schema]:
     return dataclasses.make_dataclass(schema.__name__, [field], bases=(schema,))
 
 
-def validate(config: "DataclassInstance | type[DataclassInstance]", prefix: str = "") -> None:
+def validate(config: Dataclass | type[Dataclass], prefix: str = "") -> None:
     """Check the types and ranges of all settings of a dataclass and of the dataclasses in it.
 
     Raises:
