@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 
-def make_env(name: str, physics: str = "auto", **kwargs: Any) -> Task:
+def make_env(name: str, physics: str = "auto", **kwargs: object) -> Task:
     """Create one unbatched environment.
 
     Args:

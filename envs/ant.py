@@ -16,6 +16,8 @@ from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = ["Ant", "AntOptions"]
+
 
 @dataclasses.dataclass
 class AntOptions(TaskOptions):

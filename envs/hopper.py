@@ -16,6 +16,8 @@ from mjx_walk.envs.state import Carry, State
 from mjx_walk.envs.task_options import MAX_FRAME_SKIP
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = ["Hopper", "HopperOptions"]
+
 
 @dataclasses.dataclass
 class HopperOptions(PlanarBodyOptions):

@@ -13,6 +13,8 @@ from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = ["Humanoid", "HumanoidOptions"]
+
 
 @dataclasses.dataclass
 class HumanoidOptions(HumanoidBodyOptions):

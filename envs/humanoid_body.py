@@ -16,6 +16,8 @@ from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = ["NUM_ROOT_DOFS", "HumanoidBody", "HumanoidBodyOptions"]
+
 NUM_ROOT_DOFS = 6
 """Degrees of freedom of the root's free joint, which has no motor."""
 

@@ -7,6 +7,8 @@ from jaxtyping import Float
 from mjx_walk.envs.state import State
 from mjx_walk.envs.task_options import TaskOptions
 
+__all__ = ["GymnasiumInfo", "Info", "plane_position", "plane_velocity"]
+
 Info = dict[str, Array]
 """Entries of `info` by name: `[] f32`, or `[n] f32` for tendons."""
 

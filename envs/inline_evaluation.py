@@ -6,7 +6,6 @@ third of a million training steps; inside the batch it costs its share of the en
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import flax
 import jax
@@ -16,7 +15,9 @@ import numpy as np
 from mjx_walk.envs.state import State
 from mjx_walk.envs.task import Task
 from mjx_walk.utils.setting_fields import setting
-from mjx_walk.utils.types import ITERATION_COUNT, Metric, Metrics, PolicyFn, Reduction
+from mjx_walk.utils.types import ITERATION_COUNT, Metric, Metrics, PolicyFn, PolicyParams, Reduction
+
+__all__ = ["NO_RETURN", "EvaluationConfig", "InlineEvaluation", "InlineEvaluator"]
 
 
 @dataclasses.dataclass
@@ -40,7 +41,7 @@ NO_RETURN = float(np.finfo(np.float32).min)
 class InlineEvaluation(flax.struct.PyTreeNode):
     """One round of episodes under a snapshot of the policy, and the best snapshot so far."""
 
-    policy_params: Any
+    policy_params: PolicyParams
     snapshot_iteration: jax.Array = flax.struct.field(metadata=ITERATION_COUNT)
     """`[] i32`: iterations before the snapshot was taken."""
     env: State
@@ -51,7 +52,7 @@ class InlineEvaluation(flax.struct.PyTreeNode):
     """`[E] f32`."""
     lengths: jax.Array
     """`[E] i32`."""
-    best_policy_params: Any
+    best_policy_params: PolicyParams
     best_iteration: jax.Array = flax.struct.field(metadata=ITERATION_COUNT)
     """`[] i32`: iterations before the best snapshot was taken."""
     best_return: jax.Array
@@ -66,7 +67,7 @@ class InlineEvaluator:
         task: Task,
         num_train_envs: int,
         config: EvaluationConfig,
-        policy: Callable[[Any], PolicyFn],
+        policy: Callable[[PolicyParams], PolicyFn],
         steps_per_iteration: int,
     ):
         """
@@ -82,7 +83,7 @@ class InlineEvaluator:
         self._policy = policy
         self._min_iterations = -(-config.every_steps // steps_per_iteration)
 
-    def init(self, policy_params: Any, starts: State) -> InlineEvaluation:
+    def init(self, policy_params: PolicyParams, starts: State) -> InlineEvaluation:
         """The first round, under the untrained policy.
 
         Args:
@@ -115,7 +116,7 @@ class InlineEvaluator:
         )
 
     def next_round(
-        self, evaluation: InlineEvaluation, policy_params: Any, iteration: jax.Array, starts: State
+        self, evaluation: InlineEvaluation, policy_params: PolicyParams, iteration: jax.Array, starts: State
     ) -> tuple[InlineEvaluation, Metrics]:
         """Score a round that has ended, and start the next one with the present policy.
 

@@ -16,6 +16,8 @@ from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.envs.view import View
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = ["MAX_OBSERVED_FORCE", "MAX_OBSERVED_VELOCITY", "InvertedDoublePendulum", "InvertedDoublePendulumOptions"]
+
 MAX_OBSERVED_VELOCITY = 10.0
 """Limit to which observed velocities are clipped, m/s and rad/s."""
 MAX_OBSERVED_FORCE = 10.0

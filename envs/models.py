@@ -17,6 +17,18 @@ from mjx_walk.machine.quiet_mujoco import hide_deprecations, write_no_log
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.near_misses import near_misses
 
+__all__ = [
+    "ModelNeeds",
+    "body_id",
+    "check_model",
+    "check_pose",
+    "is_coordinate",
+    "load_model",
+    "load_with_sources",
+    "warn_of_changed_sources",
+    "warn_of_coordinates",
+]
+
 _LOGGER = logging.getLogger(__name__)
 
 

@@ -4,6 +4,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
+__all__ = ["joint_of", "motor_dofs", "moved_joints", "torques_per_force"]
+
 _TRN = mujoco.mjtTrn
 _JNT, _WRAP = mujoco.mjtJoint, mujoco.mjtWrap
 _ON_A_JOINT = (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT)

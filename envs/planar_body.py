@@ -12,6 +12,8 @@ from mjx_walk.envs.state import State
 from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions
 
+__all__ = ["PlanarBody", "PlanarBodyOptions"]
+
 
 @dataclasses.dataclass
 class PlanarBodyOptions(TaskOptions):

@@ -17,6 +17,17 @@ from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.envs.view import View
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = [
+    "MIN_GOAL_DISTANCE",
+    "NUM_JOINTS",
+    "NUM_PLACED",
+    "OBJECT_HIGH",
+    "OBJECT_LOW",
+    "VELOCITY_NOISE",
+    "Pusher",
+    "PusherOptions",
+]
+
 VELOCITY_NOISE = 5e-3
 """Limit of the uniform noise on the joint velocities of a reset, rad/s."""
 OBJECT_LOW, OBJECT_HIGH = (-0.3, -0.2), (0.0, 0.2)

@@ -17,6 +17,8 @@ from mjx_walk.envs.task_options import MAX_FRAME_SKIP, TaskOptions
 from mjx_walk.envs.view import View
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = ["ANGLE_NOISE", "TARGET_RADIUS", "VELOCITY_NOISE", "Reacher", "ReacherOptions"]
+
 ANGLE_NOISE = 0.1
 """Limit of the uniform noise on the joint angles of a reset, rad."""
 VELOCITY_NOISE = 5e-3

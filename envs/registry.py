@@ -3,7 +3,6 @@
 import re
 import typing
 from pathlib import Path
-from typing import Any
 
 from mjx_walk.envs.ant import Ant, AntOptions
 from mjx_walk.envs.half_cheetah import HalfCheetah, HalfCheetahOptions
@@ -122,12 +121,12 @@ def is_registered_from(name: str, source: str | None) -> bool:
     return name in TASKS and (source is None or (known is not None and Path(known).name == Path(source).name))
 
 
-def task_name(task: Any) -> str:
+def task_name(task: object) -> str:
     """The name under which a class is registered: `MyRobot` becomes `my_robot`."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", getattr(task, "__name__", str(task))).lower()
 
 
-def _check_options(name: str, options: Any) -> None:
+def _check_options(name: str, options: object) -> None:
     if not (isinstance(options, type) and issubclass(options, TaskOptions)):
         raise UserError(f"the options of the task '{name}' are {options!r}; give a dataclass derived from TaskOptions")
     check_decorated(options, f"options of the task '{name}'")

@@ -4,6 +4,8 @@ import jax
 from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
+__all__ = ["InitialState", "with_normal_velocity", "with_uniform_noise"]
+
 InitialState = tuple[Float[Array, " nq"], Float[Array, " nv"]]
 """Position in m and rad, and velocity in m/s and rad/s."""
 

@@ -14,6 +14,8 @@ from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = ["RewardFunction", "RewardStep", "Shaping", "Terms", "check_shaping", "shaping_terms", "term_names"]
+
 Terms = dict[str, Float[Array, ""]]
 """Signed reward terms by name, `[] f32` each."""
 

@@ -1,15 +1,27 @@
 """The contract between tasks and trainers: the state of an environment, and what a trainer needs of a task."""
 
-from typing import Any, Protocol
+from typing import Protocol, runtime_checkable
 
 import flax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
+from numpy.typing import ArrayLike
 
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.utils.errors import UserError
+
+__all__ = [
+    "MAX_ABS_VALUE",
+    "NO_TIME_LIMIT",
+    "Carry",
+    "State",
+    "TrainableTask",
+    "check_action_shape",
+    "check_state_shape",
+    "is_finite",
+]
 
 NO_TIME_LIMIT = 2**31 - 1
 """Value of `max_episode_steps` when a caller or a wrapper applies the time limit."""
@@ -41,7 +53,7 @@ class State(flax.struct.PyTreeNode):
     """`[] f32` each: the reward terms under the names of Gymnasium's `info`, `nonfinite` and `overflow`."""
 
 
-def check_action_shape(action: Any, expected: tuple[int, ...]) -> None:
+def check_action_shape(action: ArrayLike | Array, expected: tuple[int, ...]) -> None:
     """Check an action before it is broadcast or converted.
 
     Raises:
@@ -51,7 +63,7 @@ def check_action_shape(action: Any, expected: tuple[int, ...]) -> None:
         raise ValueError(f"Action dimension mismatch. Expected {expected}, found {np.shape(action)}")
 
 
-def check_state_shape(**arrays: tuple[Any, int]) -> None:
+def check_state_shape(**arrays: tuple[ArrayLike | Array | None, int]) -> None:
     """Check positions and velocities before they are converted.
 
     Args:
@@ -70,6 +82,7 @@ def is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[A
     return jnp.array([jnp.all(jnp.abs(x) < limit) for x in arrays]).all()
 
 
+@runtime_checkable
 class TrainableTask(Protocol):
     """What a trainer needs of a task. All methods are pure functions of one unbatched environment."""
 

@@ -17,6 +17,8 @@ from mjx_walk.envs.task_options import MAX_FRAME_SKIP, TaskOptions
 from mjx_walk.envs.view import View
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = ["Swimmer", "SwimmerOptions"]
+
 
 @dataclasses.dataclass
 class SwimmerOptions(TaskOptions):

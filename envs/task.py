@@ -2,7 +2,6 @@
 
 import abc
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -97,7 +96,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         self.reward_terms = self._reward_term_names()
         self.metric_names = (*self.reward_terms, "nonfinite", "overflow")
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         """Pickle and copy a task as its arguments: engines hold threads and compiled functions."""
         return type(self), (self.options, self.engine.name, bool(self.kept_arrays))
 
@@ -122,7 +121,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         """The same, of this task."""
         return self.id_of(self.options)
 
-    def gymnasium_kwargs(self) -> dict[str, Any]:
+    def gymnasium_kwargs(self) -> dict[str, object]:
         """Keyword arguments of `gymnasium.make` for the equivalent environment, without those at their default."""
         return self.options.gymnasium_kwargs()
 

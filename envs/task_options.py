@@ -4,7 +4,6 @@ import dataclasses
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 from mjx_walk.envs.model_files import absolute_xml_file, model_path
 from mjx_walk.envs.reward_shaping import Shaping
@@ -12,6 +11,8 @@ from mjx_walk.envs.state import NO_TIME_LIMIT
 from mjx_walk.envs.user_files import absolute_source
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
+
+__all__ = ["MAX_FRAME_SKIP", "TaskOptions", "check_version", "with_absolute_paths"]
 
 MAX_FRAME_SKIP = 10_000
 """With more, the physics of one environment step takes minutes and cannot be interrupted."""
@@ -49,12 +50,12 @@ class TaskOptions:
                 raise UserError(f"unknown key 'env.shaping.{min(unknown)}'")
             self.shaping = Shaping(**self.shaping)
 
-    def changed(self) -> dict[str, Any]:
+    def changed(self) -> dict[str, object]:
         """Options that differ from their defaults."""
         defaults = vars(type(self)())
         return {name: value for name, value in vars(self).items() if value != defaults[name]}
 
-    def gymnasium_kwargs(self) -> dict[str, Any]:
+    def gymnasium_kwargs(self) -> dict[str, object]:
         """Keyword arguments of Gymnasium's class for the equivalent environment, without those at their default."""
         keywords = {name: value for name, value in self.changed().items() if name not in _NOT_IN_GYMNASIUM}
         if self.xml_file:  # Gymnasium finds relative paths elsewhere

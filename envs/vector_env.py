@@ -13,6 +13,8 @@ from mjx_walk.envs.task import Task
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import Metric, Metrics, Reduction
 
+__all__ = ["EpisodeSums", "Outcome", "VectorEnv", "VectorState", "check_resets"]
+
 
 class EpisodeSums(flax.struct.PyTreeNode):
     """Sums over the current episode of each environment, `[B] f32`."""

@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+__all__ = ["View"]
+
 
 class View(NamedTuple):
     """What films, pages and gait sheets show of a task."""

@@ -9,6 +9,8 @@ from pathlib import Path
 from mjx_walk.cli.console import console
 from mjx_walk.utils.versions import __version__
 
+__all__ = ["COMMANDS", "main", "usage"]
+
 COMMANDS = ("train", "eval", "play", "plots", "export", "zoo", "compare", "bench", "parity")
 _PACKAGES = ("zoo",)
 """Commands that are packages."""

@@ -21,6 +21,8 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
 from mjx_walk.utils.versions import package_versions
 
+__all__ = ["USAGE", "Arguments", "device_counts", "main"]
+
 USAGE = """
 usage: python -m mjx_walk.bench [env=humanoid] [algo=ppo] [KEY=VALUE ...] [seconds=5] [devices=all] [peers=false]
                                 [out=bench.json]

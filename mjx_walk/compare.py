@@ -24,6 +24,8 @@ from mjx_walk.storage.files import user_path
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = ["USAGE", "Arguments", "main"]
+
 USAGE = """
 usage: python -m mjx_walk.compare [env=ENV|suite=mujoco] ['algos=[ppo,sac,td3]'] [seeds=3] [out=DIR] [KEY=VALUE ...]
 

@@ -14,6 +14,8 @@ from mjx_walk.training.summary import choice_line, score_lines
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import MAX_SEED, setting
 
+__all__ = ["USAGE", "Arguments", "main"]
+
 USAGE = """
 usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [policy=final|best] [episodes=100] [backend=gymnasium|sim] [seed=0]
                                [physics=ENGINE]

@@ -13,6 +13,8 @@ from mjx_walk.training.summary import choice_line
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = ["USAGE", "Arguments", "main"]
+
 USAGE = """
 usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [format=onnx] [dtype=float64|float32]
                                  [out=FILE.onnx]

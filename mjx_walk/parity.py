@@ -11,6 +11,8 @@ from mjx_walk.evaluation.random_steps import take_random_steps
 from mjx_walk.machine.devices import default_device
 from mjx_walk.utils.setting_fields import MAX_SEED, setting
 
+__all__ = ["USAGE", "Arguments", "main"]
+
 USAGE = """
 usage: python -m mjx_walk.parity [physics=warp|jax] [env=all] [version=v5] [num_envs=32] [steps=60] [seed=0]
                                  [random_steps=10_000_000]

@@ -18,6 +18,8 @@ from mjx_walk.viewing.page import require_library, write_page
 from mjx_walk.viewing.rendering import write_film
 from mjx_walk.viewing.viewer import show
 
+__all__ = ["USAGE", "Arguments", "main"]
+
 USAGE = """
 usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [policy=best|final] [seed=0] [width=640] [height=480] [out=FILE.mp4]
                                [html=FILE.html] [gait=FILE.png] [strip=FILE.png start=5 seconds=1] [viewer=true]

@@ -7,6 +7,8 @@ from mjx_walk.cli import parsing
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.run_plots import plot_run
 
+__all__ = ["USAGE", "Arguments", "main"]
+
 USAGE = """
 usage: python -m mjx_walk.plots run=RUN_DIR
 

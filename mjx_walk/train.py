@@ -42,6 +42,8 @@ from mjx_walk.training.distributed import Processes, join_processes
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import describe, meanings, refuse_ineffective, table
 
+__all__ = ["USAGE", "Own", "main"]
+
 _NAMES = textwrap.fill(
     f"env={'|'.join(TASKS)}".replace("|", " | "), 100, initial_indent="  ", subsequent_indent="      "
 )

@@ -2,7 +2,8 @@
 
 Most programs here take longer to compile than to run, and programs that call back into Python, as MuJoCo's C library
 does, are in no cache. `_QUICK_COMPILE` cuts compile times. `helpers.OPTIMIZED` is for programs that run for long.
-`SAFE_REDUCTIONS` is set here, because tests use JAX before they call anything that sets it.
+`SAFE_REDUCTIONS` is set here, because tests use JAX before they call anything that sets it. The shapes in the
+signatures of `algos` and `common` are checked at every call.
 """
 
 import atexit
@@ -13,8 +14,10 @@ import shutil
 import tempfile
 
 import pytest
+from shapes import check_rooms
 from xla_flags import SAFE_REDUCTIONS, quick_compile
 
+check_rooms()
 os.environ["JAX_PLATFORMS"] = "cpu"
 _QUICK_COMPILE = quick_compile(0)
 

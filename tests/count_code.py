@@ -35,6 +35,12 @@ def main(tree: Path) -> None:
     print(f"lines of the longest function   {length} ({longest})")
     print(f"functions inside functions      {sum(map(num_inner, functions))}")
     print(f"lines of product code           {sum(map(num_code_lines, sources))}")
+    with_any = sum(map(says_any, functions))
+    base = ast.walk(ast.parse((tree / "mjx_walk/algos/base.py").read_text()))
+    of_base = sum(says_any(node) for node in base if isinstance(node, ast.FunctionDef))
+    print(f"signatures with Any             {with_any} of {len(functions)}, {of_base} in algos/base.py")
+    firsts = [text.split(maxsplit=1)[0] for source in sources for text in docstrings(source) if text.strip()]
+    print(f"docstrings that begin with What {firsts.count('What')} of {len(firsts)}")
 
 
 def room(module: str) -> str:
@@ -59,6 +65,21 @@ def num_code_lines(source: str) -> int:
     texts = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Expr)]
     texts = [node for node in texts if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)]
     return len(lines - {line for node in texts for line in range(node.lineno, node.end_lineno + 1)})
+
+
+def says_any(function: ast.FunctionDef) -> bool:
+    """Whether the signature has an `Any`, in an argument or in what it returns."""
+    every = function.args
+    arguments = [*every.posonlyargs, *every.args, *every.kwonlyargs, every.vararg, every.kwarg]
+    hints = [argument.annotation for argument in arguments if argument] + [function.returns]
+    nodes = [node for hint in hints if hint for node in ast.walk(hint)]
+    return any("Any" in (getattr(node, "id", ""), getattr(node, "attr", "")) for node in nodes)
+
+
+def docstrings(source: str) -> list[str]:
+    """Docstrings of modules, classes, functions, fields and constants."""
+    nodes = [node.value for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Expr)]
+    return [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
 
 
 def floors(imports: dict[str, set[str]]) -> int:

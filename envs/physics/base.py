@@ -1,7 +1,7 @@
 """The interface between tasks and engines: physics state and control in, physics state and derived arrays out."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, ParamSpec, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,8 @@ from jaxtyping import Bool, Float
 
 from mjx_walk.envs.physics.preparation import Preparation
 from mjx_walk.machine.compat import standard_dtypes
+
+__all__ = ["Derived", "Engine", "EngineFactory", "PhysicsState", "batch_once"]
 
 Derived = dict[str, Array]
 """MuJoCo arrays by their `mjData` names, for example `cinert`, `[nbody, 10] f32`."""
@@ -62,11 +64,14 @@ class Engine(Protocol):
         ...
 
 
+_Arguments = ParamSpec("_Arguments")
+_Outputs = TypeVar("_Outputs")
+
 EngineFactory = Callable[[mujoco.MjModel, int, tuple[str, ...]], Engine]
 """`(model, num_substeps, derived) → Engine`."""
 
 
-def batch_once(batch_fn: Callable[..., Any]) -> Callable[..., Any]:
+def batch_once(batch_fn: Callable[_Arguments, _Outputs]) -> Callable[_Arguments, _Outputs]:
     """Turn a batched function into an unbatched one that is called once per batch under `vmap`.
 
     Args:
@@ -80,7 +85,7 @@ def batch_once(batch_fn: Callable[..., Any]) -> Callable[..., Any]:
     @custom_vmap
     @standard_dtypes()  # `vmap` may trace this after `Task.step` has returned
     def on_batch(*args):
-        return batch_fn(*args)
+        return batch_fn(*args)  # type: ignore[call-arg]  # there are no keyword arguments
 
     @on_batch.def_vmap
     def _(axis_size, in_batched, *args):

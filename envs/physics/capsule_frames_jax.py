@@ -11,6 +11,8 @@ from mujoco.mjx._src import collision_driver, collision_primitive
 from mujoco.mjx._src.collision_types import Collision
 from mujoco.mjx._src.types import Data, GeomType, Model
 
+__all__ = ["install", "plane_capsule"]
+
 _MIN_NORM = 1e-15
 
 

@@ -8,6 +8,8 @@ from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive
 from mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core import mat23f
 from mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core import plane_capsule as upstream_plane_capsule
 
+__all__ = ["install", "plane_capsule"]
+
 
 @wp.func
 def plane_capsule(

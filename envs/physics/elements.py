@@ -7,6 +7,34 @@ import mujoco
 import numpy as np
 from jaxtyping import Int, Shaped
 
+__all__ = [
+    "LEAST_PYRAMIDAL_FRICTION",
+    "Users",
+    "any_of",
+    "balanced_bodies",
+    "branching_armatures",
+    "disabled_motors",
+    "fluid_geoms",
+    "motors_limited_twice",
+    "moving_equalities",
+    "name_of",
+    "named",
+    "negative_joints",
+    "negative_tendons",
+    "option",
+    "overlapping_joint_limits",
+    "overlapping_tendon_limits",
+    "pairs_that_move",
+    "parallel_capsules",
+    "plugins",
+    "polynomial_joints",
+    "side_sites_elsewhere",
+    "slippery_contacts",
+    "turning_bodies",
+    "unmoved_tendons",
+    "user_motors",
+]
+
 Users = Callable[[mujoco.MjModel], Iterator[str]]
 """The elements of a model that use a feature, as `kind 'name'`."""
 

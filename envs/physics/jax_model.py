@@ -2,6 +2,8 @@
 
 import mujoco
 
+__all__ = ["adapt_model"]
+
 _SPRING = int(mujoco.mjtDisableBit.mjDSBL_SPRING)
 _DAMPER = int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
 

@@ -21,6 +21,8 @@ from mjx_walk.envs.physics.jax_model import adapt_model
 from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
 from mjx_walk.envs.physics.preparation import Preparation
 
+__all__ = ["JaxEngine"]
+
 _RK4_STEP = (0.0, 0.5, 0.5, 1.0)
 _RK4_WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 

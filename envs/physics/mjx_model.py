@@ -8,6 +8,8 @@ from mujoco import mjx
 
 from mjx_walk.envs.physics.base import Derived
 
+__all__ = ["MIN_SOLVER_ITERATIONS", "read_derived", "with_newton_solver"]
+
 MIN_SOLVER_ITERATIONS = 8
 """Newton iterations and line-search steps. In float32, 8 give the same result as 50; 4 do only with few contacts."""
 

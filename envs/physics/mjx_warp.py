@@ -22,6 +22,8 @@ from mjx_walk.envs.physics.static_pairs import drop_static_pairs
 from mjx_walk.envs.physics.warp_kernels import choose_cache, load_kernels
 from mjx_walk.machine.devices import default_device
 
+__all__ = ["CONSTRAINTS_PER_ENV", "CONTACTS_PER_ENV", "SPARE_CONTACTS", "WarpEngine", "warp_device"]
+
 CONTACTS_PER_ENV = 40
 """Mean capacity per environment for candidate geom pairs, and for contacts. The batch shares both buffers.
 

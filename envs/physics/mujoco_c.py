@@ -18,6 +18,8 @@ from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.derived_arrays import derived_shapes
 from mjx_walk.envs.physics.preparation import Preparation
 
+__all__ = ["CEngine"]
+
 _WARNING = mujoco.mjtWarning
 _BAD_STATE = [int(_WARNING.mjWARN_BADQPOS), int(_WARNING.mjWARN_BADQVEL), int(_WARNING.mjWARN_BADQACC)]
 _MIN_ENVS_PER_THREAD = 8

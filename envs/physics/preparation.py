@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextvars import ContextVar
 
+__all__ = ["Preparation", "nothing_runs"]
+
 _nothing_runs: ContextVar[bool] = ContextVar("nothing_runs", default=False)
 
 

@@ -14,6 +14,8 @@ from jaxtyping import Bool
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 
+__all__ = ["drop_static_pairs", "install"]
+
 _NEVER = -1e10
 """Margin of a pair that is never in contact, m."""
 

@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import mujoco
@@ -21,6 +20,8 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
 
 from mjx_walk.storage.files import is_writable_folder, user_folder
+
+__all__ = ["Variants", "choose_cache", "launched_variants", "load_kernels"]
 
 _LOGGER = logging.getLogger("mjx_walk.progress")
 
@@ -113,15 +114,21 @@ def launched_variants(model: mujoco.MjModel, njmax: int) -> Variants:
 def _noting_launches(variants: Variants) -> Iterator[None]:
     """Replace Warp's launches by notes of the kernels, and follow each branch of its graphs once."""
 
-    def launch(kernel: wp.Kernel, dim: int | Sequence[int], *_: Any, block_dim: int | None = None, **__: Any) -> None:
+    def launch(
+        kernel: wp.Kernel, dim: int | Sequence[int], *_: object, block_dim: int | None = None, **__: object
+    ) -> None:
         if math.prod(dim if isinstance(dim, Sequence) else [dim]):  # else Warp needs no kernel
             variants.setdefault(kernel.module, set()).add(block_dim)
 
-    def capture_while(_: wp.array, while_body: Callable, stream: Any = None, **arguments: Any) -> None:
+    def capture_while(_: wp.array, while_body: Callable, stream: object = None, **arguments: object) -> None:
         while_body(**arguments)
 
     def capture_if(
-        _: wp.array, on_true: Callable | None = None, on_false: Callable | None = None, stream: Any = None, **arguments
+        _: wp.array,
+        on_true: Callable | None = None,
+        on_false: Callable | None = None,
+        stream: object = None,
+        **arguments,
     ) -> None:
         for branch in filter(None, (on_true, on_false)):
             branch(**arguments)

@@ -3,11 +3,11 @@
 Networks, returns, replay and optimizers that they share are in `mjx_walk.common`; the loop is in `mjx_walk.training`.
 """
 
-from typing import Any
+from typing import Protocol
 
 from mjx_walk.machine import quiet_mjx  # noqa: F401  # isort: skip
 from mjx_walk.algos.a2c import A2C, A2CConfig
-from mjx_walk.algos.base import Algorithm, TrainState, is_finite, learned_leaves, without_replay
+from mjx_walk.algos.base import Algorithm, AlgorithmConfig, TrainState, is_finite, learned_leaves, without_replay
 from mjx_walk.algos.csac import CSAC, CSACConfig
 from mjx_walk.algos.ddpg import DDPG, DDPGConfig
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
@@ -39,6 +39,7 @@ __all__ = [
     "ALGORITHMS",
     "BUILT_IN_ALGORITHMS",
     "Algorithm",
+    "NamedConfig",
     "TrainState",
     "is_finite",
     "learned_leaves",
@@ -48,8 +49,15 @@ __all__ = [
 ]
 
 
+class NamedConfig(AlgorithmConfig, Protocol):
+    """Settings of one algorithm."""
+
+    name: str
+    """The algorithm's name in `ALGORITHMS`."""
+
+
 def make_algorithm(
-    task: Task, num_envs: int, evaluation: EvaluationConfig, config: Any, axis_name: str | None = None
+    task: Task, num_envs: int, evaluation: EvaluationConfig, config: NamedConfig, axis_name: str | None = None
 ) -> Algorithm:
     """Build the algorithm whose settings `config` holds.
 

@@ -5,12 +5,17 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 from brax.training.acme.running_statistics import RunningStatisticsState
+from jax import Array
+from jaxtyping import Float
 
 from mjx_walk.algos.on_policy import OnPolicyBatch, OnPolicyState
 from mjx_walk.algos.policy_gradient import PolicyGradientAlgorithm, PolicyGradientConfig, Samples, normalize
 from mjx_walk.common.brax_losses import PPOParams, compute_gae
 from mjx_walk.common.exploration import Exploration, NoExploration, OrnsteinUhlenbeck
 from mjx_walk.utils.setting_fields import AnyBut, setting
+from mjx_walk.utils.types import Losses
+
+__all__ = ["A2C", "A2CConfig"]
 
 
 @dataclasses.dataclass
@@ -25,13 +30,11 @@ class A2CConfig(PolicyGradientConfig):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class A2C(PolicyGradientAlgorithm):
+class A2C(PolicyGradientAlgorithm[A2CConfig]):
     """The policy gradient on generalised advantages.
 
     Source: Mnih et al. 2016, algorithm S3.
     """
-
-    config: A2CConfig
 
     def make_exploration(self) -> Exploration:
         if not self.config.ou_noise_std:
@@ -40,7 +43,7 @@ class A2C(PolicyGradientAlgorithm):
 
     def value_loss(
         self, params: PPOParams, normalizer: RunningStatisticsState, samples: Samples
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+    ) -> tuple[Float[Array, ""], Losses]:
         values = self.nets.value_network.apply(normalizer, params.value, samples.observation)
         loss = jnp.square(samples.target - values).mean()
         return self.config.value_loss_coef * loss, {"value_loss": loss}

@@ -3,17 +3,29 @@
 import abc
 import copy
 import dataclasses
-from typing import Any
+from typing import Generic, Protocol, TypeVar
 
 import flax
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, PRNGKeyArray
 
 from mjx_walk.envs import Task
 from mjx_walk.envs.inline_evaluation import EvaluationConfig, InlineEvaluation, InlineEvaluator
 from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.envs.vector_env import VectorEnv, VectorState
-from mjx_walk.utils.types import ITERATION_COUNT, PER_DEVICE, RANDOM_KEY, Metrics, PolicyFn, leaves_with
+from mjx_walk.utils.types import (
+    ITERATION_COUNT,
+    PER_DEVICE,
+    RANDOM_KEY,
+    Metrics,
+    PolicyFn,
+    PolicyParams,
+    leaves_with,
+)
+
+__all__ = ["Algorithm", "AlgorithmConfig", "TrainState", "is_finite", "learned_leaves", "without_replay"]
 
 
 class TrainState(flax.struct.PyTreeNode):
@@ -21,12 +33,24 @@ class TrainState(flax.struct.PyTreeNode):
 
     env: VectorState = flax.struct.field(metadata=PER_DEVICE)
     evaluation: InlineEvaluation = flax.struct.field(metadata=PER_DEVICE)
-    key: jax.Array = flax.struct.field(metadata=RANDOM_KEY)
-    iterations: jax.Array = flax.struct.field(metadata=ITERATION_COUNT)
+    key: Array = flax.struct.field(metadata=RANDOM_KEY)
+    iterations: Array = flax.struct.field(metadata=ITERATION_COUNT)
     """`[] i32`: iterations so far."""
 
 
-def learned_leaves(state: TrainState) -> dict[str, jax.Array]:
+class AlgorithmConfig(Protocol):
+    """Settings that every algorithm has."""
+
+    init_at_random_episode_step: bool
+    """Start the first episodes at random step counts."""
+
+
+_StateT = TypeVar("_StateT", bound=TrainState)
+_BatchT = TypeVar("_BatchT")
+_ConfigT = TypeVar("_ConfigT", bound=AlgorithmConfig)
+
+
+def learned_leaves(state: TrainState) -> dict[str, Array]:
     """Networks, optimizers and running statistics: the floating-point leaves that are not per device, by their paths.
 
     The other leaves need no check. A task ends an episode whose physics is not finite, and running returns enter the
@@ -40,20 +64,22 @@ def learned_leaves(state: TrainState) -> dict[str, jax.Array]:
     }
 
 
-def is_finite(state: TrainState) -> jax.Array:
-    """Whether every learned leaf is finite, `[] bool`."""
+def is_finite(state: TrainState) -> Bool[Array, ""]:
+    """Whether every learned leaf is finite."""
     return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in learned_leaves(state).values()]))
 
 
-def without_replay(state: Any) -> Any:
+def without_replay(state: _StateT) -> _StateT:
     """A TrainState, or its shapes, without the replay buffer."""
     fields = {field.name: () for field in dataclasses.fields(state) if field.metadata.get("replay")}
     return state.replace(**fields)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Algorithm(abc.ABC):
-    """A learning algorithm for one task, as pure functions of a `TrainState`.
+class Algorithm(abc.ABC, Generic[_StateT, _BatchT, _ConfigT]):
+    """A learning algorithm for one task, as pure functions of its state.
+
+    `Algorithm[State, Batch, Config]`: its `TrainState`, what `collect` passes to `learn`, and its settings.
 
     `collect` contains no gradients and `learn` no physics. An object is hashed by its identity and is static under
     `jit`; constants are built when it is constructed.
@@ -65,7 +91,7 @@ class Algorithm(abc.ABC):
     """Environments that train, B."""
     evaluation: EvaluationConfig
     """Settings of the inline evaluation."""
-    config: Any
+    config: _ConfigT
     """Settings of the algorithm, copied."""
     axis_name: str | None = None
     """Mapped axis over devices in `learn`, if several devices train one run."""
@@ -79,7 +105,7 @@ class Algorithm(abc.ABC):
         env = VectorEnv(self.task, self.num_envs, evaluator, self.config.init_at_random_episode_step)
         self._set(evaluator=evaluator, env=env)
 
-    def _set(self, **constants: Any) -> None:
+    def _set(self, **constants: object) -> None:
         """Set fields, during construction only."""
         for name, value in constants.items():
             object.__setattr__(self, name, value)
@@ -94,7 +120,7 @@ class Algorithm(abc.ABC):
         """Memory of the replay, if there is one."""
         return 0
 
-    def start_iteration(self, state: TrainState, pool_key: jax.Array) -> tuple[VectorState, InlineEvaluation, Metrics]:
+    def start_iteration(self, state: _StateT, pool_key: PRNGKeyArray) -> tuple[VectorState, InlineEvaluation, Metrics]:
         """Renew the pool of random starts, and start the next evaluation round if one has ended.
 
         Returns:
@@ -106,27 +132,27 @@ class Algorithm(abc.ABC):
         )
         return env, evaluation, scores
 
-    def state_shapes(self) -> Any:
-        """Shapes and dtypes of a `TrainState`, without running anything."""
+    def state_shapes(self) -> _StateT:
+        """Shapes and dtypes of the state, without running anything."""
         with nothing_runs():
             return jax.eval_shape(self.init, jax.random.PRNGKey(0))
 
     @abc.abstractmethod
-    def init(self, key: jax.Array) -> Any:
-        """The `TrainState` before the first iteration."""
+    def init(self, key: PRNGKeyArray) -> _StateT:
+        """The state before the first iteration."""
 
     @abc.abstractmethod
-    def collect(self, state: Any) -> tuple[Any, Any]:
-        """Act and step all environments: `TrainState → (TrainState, batch)`."""
+    def collect(self, state: _StateT) -> tuple[_StateT, _BatchT]:
+        """Act and step all environments: `state → (state, batch)`."""
 
     @abc.abstractmethod
-    def learn(self, state: Any, batch: Any) -> tuple[Any, Metrics]:
-        """Gradient steps on the batch: `(TrainState, batch) → (TrainState, metrics)`."""
+    def learn(self, state: _StateT, batch: _BatchT) -> tuple[_StateT, Metrics]:
+        """Gradient steps on the batch: `(state, batch) → (state, metrics)`."""
 
     @abc.abstractmethod
-    def policy_params(self, state: Any) -> Any:
+    def policy_params(self, state: _StateT) -> PolicyParams:
         """The part of the state that the policy needs, small enough to ship."""
 
     @abc.abstractmethod
-    def policy(self, policy_params: Any, deterministic: bool = True) -> PolicyFn:
+    def policy(self, policy_params: PolicyParams, deterministic: bool = True) -> PolicyFn:
         """The policy as a function of observations and a key."""

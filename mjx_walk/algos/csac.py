@@ -5,18 +5,22 @@ al. 2025) and FlashSAC. Policy and temperature are Brax's.
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from brax.training.agents.sac.networks import SACNetworks
 from brax.training.networks import FeedForwardNetwork
+from jax import Array
+from jaxtyping import Float, PRNGKeyArray
 
-from mjx_walk.algos.off_policy import Batch
+from mjx_walk.algos.off_policy_state import Batch
 from mjx_walk.algos.sac import SAC, SACConfig, SACState
 from mjx_walk.common import networks
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
+from mjx_walk.utils.types import Losses, Params
+
+__all__ = ["CSAC", "CSACConfig", "project"]
 
 
 @dataclasses.dataclass
@@ -42,7 +46,7 @@ class CSAC(SAC):
     config: CSACConfig
     critics: FeedForwardNetwork = dataclasses.field(init=False, repr=False)
     """Logits of the atoms, `[…, 2, num_atoms]`."""
-    atoms: jax.Array = dataclasses.field(init=False, repr=False)
+    atoms: Array = dataclasses.field(init=False, repr=False)
     """`[num_atoms] f32`, evenly spaced."""
 
     def make_networks(self) -> SACNetworks:
@@ -58,17 +62,21 @@ class CSAC(SAC):
         expected_returns = dataclasses.replace(self.critics, apply=self._expected_returns)
         return networks.make_sac_networks(self.task, config, expected_returns)
 
-    def log_probs(self, critic: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
-        """Log-probabilities of the atoms, `[…, 2, num_atoms]`."""
+    def log_probs(
+        self, critic: Params, obs: Float[Array, "N observation_size"], action: Float[Array, "N action_size"]
+    ) -> Float[Array, "N 2 num_atoms"]:
+        """Log-probabilities of the atoms of both critics."""
         return jax.nn.log_softmax(self.critics.apply(None, critic, obs, action))
 
-    def _expected_returns(self, _: Any, critic: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
+    def _expected_returns(
+        self, _: object, critic: Params, obs: Float[Array, "N observation_size"], action: Float[Array, "N action_size"]
+    ) -> Float[Array, "N 2"]:
         return jnp.exp(self.log_probs(critic, obs, action)) @ self.atoms
 
     def critic_loss(
-        self, critic: Any, learner: SACState, batch: Batch, key: jax.Array
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The loss of the critics, `[] f32`, and the target's mass on the two outermost atoms.
+        self, critic: Params, learner: SACState, batch: Batch, key: PRNGKeyArray
+    ) -> tuple[Float[Array, ""], Losses]:
+        """The loss of the critics, and the target's mass on the two outermost atoms.
 
         `normalized_return_max` bounds the return without the entropy bonus. What the bonus adds beyond it goes to the
         outermost atoms.
@@ -90,16 +98,18 @@ class CSAC(SAC):
         return -(target[:, None] * log_probs).sum(axis=(-2, -1)).mean(), metrics
 
 
-def project(probs: jax.Array, positions: jax.Array, atoms: jax.Array) -> jax.Array:
+def project(
+    probs: Float[Array, "N A"], positions: Float[Array, "N A"], atoms: Float[Array, " A"]
+) -> Float[Array, "N A"]:
     """Distribute the mass at each position over its two neighbouring atoms; mass outside goes to the outermost atoms.
 
     Args:
-        probs: `[B, A]`.
-        positions: `[B, A]`, the positions of the mass.
-        atoms: `[A]`, evenly spaced.
+        probs: masses, which sum to 1.
+        positions: where each of them lies.
+        atoms: evenly spaced.
 
     Returns:
-        Probabilities of the atoms, `[B, A]`. The mean is preserved where no mass lies outside.
+        Probabilities of the atoms. The mean is preserved where no mass lies outside.
     """
     spacing = atoms[1] - atoms[0]
     positions = jnp.clip(positions, atoms[0], atoms[-1])

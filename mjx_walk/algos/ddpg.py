@@ -6,6 +6,8 @@ from typing import ClassVar
 from mjx_walk.algos.deterministic import DeterministicAlgorithm, DeterministicConfig
 from mjx_walk.utils.setting_fields import setting
 
+__all__ = ["DDPG", "DDPGConfig"]
+
 
 @dataclasses.dataclass
 class DDPGConfig(DeterministicConfig):
@@ -15,9 +17,7 @@ class DDPGConfig(DeterministicConfig):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class DDPG(DeterministicAlgorithm):
+class DDPG(DeterministicAlgorithm[DDPGConfig]):
     """One critic, targets without smoothing, and a policy that moves with every critic update."""
 
     num_critics: ClassVar[int] = 1
-
-    config: DDPGConfig

@@ -1,20 +1,25 @@
 """What TD3 and DDPG share: a deterministic policy, critics whose minimum is the target, and Gaussian exploration."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar, TypeVar
 
 import flax
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training import types as brax_types
 from brax.training.networks import FeedForwardNetwork
+from jax import Array
+from jaxtyping import Float, PRNGKeyArray
 
-from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm
+from mjx_walk.algos.off_policy import OffPolicyAlgorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
+from mjx_walk.algos.off_policy_state import Batch
 from mjx_walk.common import networks
 from mjx_walk.common.optimizers import polyak_update
 from mjx_walk.utils.setting_fields import AnyBut, setting
+from mjx_walk.utils.types import Losses, Params
+
+__all__ = ["DeterministicAlgorithm", "DeterministicConfig", "DeterministicState"]
 
 
 @dataclasses.dataclass
@@ -40,16 +45,19 @@ class DeterministicConfig(OffPolicyConfig):
 class DeterministicState(flax.struct.PyTreeNode):
     """Networks and optimizers."""
 
-    policy: brax_types.Params
-    critic: brax_types.Params
-    target_policy: brax_types.Params
-    target_critic: brax_types.Params
+    policy: Params
+    critic: Params
+    target_policy: Params
+    target_critic: Params
     policy_optimizer: optax.OptState
     critic_optimizer: optax.OptState
 
 
+_DeterministicConfigT = TypeVar("_DeterministicConfigT", bound=DeterministicConfig)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
-class DeterministicAlgorithm(OffPolicyAlgorithm):
+class DeterministicAlgorithm(OffPolicyAlgorithm[DeterministicState, _DeterministicConfigT]):
     """A deterministic policy, and critics whose minimum is the target.
 
     Source: Fujimoto et al. 2018, algorithm 1: both targets move when the policy does.
@@ -57,10 +65,9 @@ class DeterministicAlgorithm(OffPolicyAlgorithm):
 
     num_critics: ClassVar[int]
 
-    config: DeterministicConfig
     policy_network: FeedForwardNetwork = dataclasses.field(init=False, repr=False)
     critic_network: FeedForwardNetwork = dataclasses.field(init=False, repr=False)
-    exploration_noise: jax.Array = dataclasses.field(init=False, repr=False)
+    exploration_noise: Array = dataclasses.field(init=False, repr=False)
     """`[B, 1]`: standard deviation of each environment's noise."""
 
     def __post_init__(self) -> None:
@@ -79,7 +86,7 @@ class DeterministicAlgorithm(OffPolicyAlgorithm):
         """Standard deviation and bound of the noise that smooths the target policy."""
         return 0.0, 0.0
 
-    def init_learner(self, key: jax.Array) -> DeterministicState:
+    def init_learner(self, key: PRNGKeyArray) -> DeterministicState:
         policy_key, critic_key = jax.random.split(key)
         policy, critic = self.policy_network.init(policy_key), self.critic_network.init(critic_key)
         return DeterministicState(
@@ -91,19 +98,25 @@ class DeterministicAlgorithm(OffPolicyAlgorithm):
             critic_optimizer=self.optimizer.init(critic),
         )
 
-    def deterministic_action(self, params: Any, obs: jax.Array) -> jax.Array:
-        """The action of the policy, `[…, action_size]`."""
+    def deterministic_action(
+        self, params: Params, obs: Float[Array, "B observation_size"]
+    ) -> Float[Array, "B action_size"]:
+        """The action of the policy."""
         return jnp.tanh(self.policy_network.apply(None, params, obs))
 
-    def explore(self, params: Any, obs: jax.Array, key: jax.Array) -> jax.Array:
+    def explore(
+        self, params: Params, obs: Float[Array, "B observation_size"], key: PRNGKeyArray
+    ) -> Float[Array, "B action_size"]:
         action = self.deterministic_action(params, obs)
         return jnp.clip(action + self.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
 
-    def act(self, params: Any, obs: jax.Array, key: jax.Array, deterministic: bool) -> jax.Array:
+    def act(
+        self, params: Params, obs: Float[Array, "B observation_size"], key: PRNGKeyArray, deterministic: bool
+    ) -> Float[Array, "B action_size"]:
         return self.deterministic_action(params, obs) if deterministic else self.explore(params, obs, key)
 
-    def critic_target(self, learner: DeterministicState, batch: Batch, key: jax.Array) -> jax.Array:
-        """Targets of the critics, `[N]`, from the smoothed target policy and the minimum of the target critics."""
+    def critic_target(self, learner: DeterministicState, batch: Batch, key: PRNGKeyArray) -> Float[Array, " N"]:
+        """Targets of the critics, from the smoothed target policy and the minimum of the target critics."""
         data = batch.transitions
         std, bound = self.target_noise
         action = self.deterministic_action(learner.target_policy, data.next_observation)
@@ -112,21 +125,23 @@ class DeterministicAlgorithm(OffPolicyAlgorithm):
         values = self.critic_network.apply(None, learner.target_critic, data.next_observation, action)
         return data.reward * batch.reward_scale + data.discount * values.min(axis=-1)
 
-    def critic_loss(self, critic: Any, target: jax.Array, batch: Batch) -> tuple[jax.Array, jax.Array]:
+    def critic_loss(
+        self, critic: Params, target: Float[Array, " N"], batch: Batch
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """The squared error, summed over critics, and their mean value."""
         data = batch.transitions
         values = self.critic_network.apply(None, critic, data.observation, data.action)
         return jnp.square(values - target[:, None]).mean(axis=0).sum(), values.mean()
 
-    def policy_loss(self, policy: Any, critic: Any, batch: Batch) -> jax.Array:
+    def policy_loss(self, policy: Params, critic: Params, batch: Batch) -> Float[Array, ""]:
         """Minus the first critic's value of the policy's actions."""
         obs = batch.transitions.observation
         action = self.deterministic_action(policy, obs)
         return -self.critic_network.apply(None, critic, obs, action)[:, 0].mean()
 
     def critic_update(
-        self, learner: DeterministicState, batch: Batch, key: jax.Array
-    ) -> tuple[DeterministicState, dict[str, jax.Array]]:
+        self, learner: DeterministicState, batch: Batch, key: PRNGKeyArray
+    ) -> tuple[DeterministicState, Losses]:
         target = self.critic_target(learner, batch, key)
         (loss, value), grads = jax.value_and_grad(self.critic_loss, has_aux=True)(learner.critic, target, batch)
         rate = self.config.critic_learning_rate * batch.rate_factor
@@ -135,8 +150,8 @@ class DeterministicAlgorithm(OffPolicyAlgorithm):
         return learner.replace(critic=critic, critic_optimizer=critic_optimizer), metrics
 
     def full_update(
-        self, learner: DeterministicState, batch: Batch, key: jax.Array
-    ) -> tuple[DeterministicState, dict[str, jax.Array]]:
+        self, learner: DeterministicState, batch: Batch, key: PRNGKeyArray
+    ) -> tuple[DeterministicState, Losses]:
         learner, metrics = self.critic_update(learner, batch, key)
         loss, grads = jax.value_and_grad(self.policy_loss)(learner.policy, learner.critic, batch)
         rate = self.config.policy_learning_rate * batch.rate_factor

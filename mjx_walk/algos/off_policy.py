@@ -3,58 +3,36 @@
 import abc
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Generic, TypeVar
 
-import flax
 import jax
 import jax.numpy as jnp
 import optax
 from brax.training.acme import running_statistics
 from brax.training.acme.running_statistics import RunningStatisticsState
+from jax import Array
+from jaxtyping import Float, PRNGKeyArray
 
-from mjx_walk.algos.base import Algorithm, TrainState
+from mjx_walk.algos.base import Algorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
+from mjx_walk.algos.off_policy_state import Batch, LearnerT, OffPolicyState
 from mjx_walk.common import networks, returns, rollout
-from mjx_walk.common.optimizers import (
-    anneal_discount,
-    apply_gradients,
-    make_adam,
-    remaining_fraction,
-    schedule_factor,
-)
+from mjx_walk.common.optimizers import anneal_discount, apply_gradients, make_adam, remaining_fraction, schedule_factor
 from mjx_walk.common.replay_buffer import Replay, ReplayBuffer, Steps
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.types import RANDOM_KEY, REPLAY, Metrics, PolicyFn, Transition, as_means
+from mjx_walk.utils.types import Losses, Metrics, Params, PolicyFn, PolicyParams, as_means
 
+__all__ = ["OffPolicyAlgorithm"]
 
-class Batch(NamedTuple):
-    """Transitions to learn from, and the settings that change over a run."""
-
-    transitions: Transition
-    """`[N, …]`, see `ReplayBuffer.sample`; observations normalized, actions in `[-1, 1]`."""
-    reward_scale: jax.Array
-    rate_factor: jax.Array | float
-    """The factor of the learning rates."""
-    remaining: jax.Array | float
-    """The fraction of `schedule_steps` that is left."""
-
-
-class OffPolicyState(TrainState):
-    """State of an off-policy algorithm."""
-
-    learner: Any
-    """Networks and optimizers."""
-    critic_updates: jax.Array
-    """`[] i32`: critic updates so far."""
-    normalizer: RunningStatisticsState
-    return_scale: returns.ReturnScale
-    replay: Replay = flax.struct.field(metadata=REPLAY)
-    noise_key: jax.Array = flax.struct.field(metadata=RANDOM_KEY)
-    """The exploration noise of every step follows from it."""
+_OffPolicyConfigT = TypeVar("_OffPolicyConfigT", bound=OffPolicyConfig)
+_ParamsT = TypeVar("_ParamsT")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class OffPolicyAlgorithm(Algorithm):
+class OffPolicyAlgorithm(
+    Algorithm[OffPolicyState[LearnerT], tuple[Steps, Metrics], _OffPolicyConfigT], Generic[LearnerT, _OffPolicyConfigT]
+):
     """Stores steps in a replay and learns from samples of it. Subclasses define networks, losses and updates.
 
     All observations that a subclass sees are normalized, and all its actions lie in `[-1, 1]`.
@@ -63,7 +41,6 @@ class OffPolicyAlgorithm(Algorithm):
         UserError: settings that exclude each other.
     """
 
-    config: OffPolicyConfig
     buffer: ReplayBuffer = dataclasses.field(init=False, repr=False)
     optimizer: optax.GradientTransformation = dataclasses.field(init=False, repr=False)
 
@@ -91,23 +68,27 @@ class OffPolicyAlgorithm(Algorithm):
     # What an algorithm defines.
 
     @abc.abstractmethod
-    def init_learner(self, key: jax.Array) -> Any:
+    def init_learner(self, key: PRNGKeyArray) -> LearnerT:
         """Networks and optimizers before the first update."""
 
     @abc.abstractmethod
-    def act(self, params: Any, obs: jax.Array, key: jax.Array, deterministic: bool) -> jax.Array:
-        """Actions `[B, action_size]` of the policy."""
+    def act(
+        self, params: Params, obs: Float[Array, "B observation_size"], key: PRNGKeyArray, deterministic: bool
+    ) -> Float[Array, "B action_size"]:
+        """Actions of the policy."""
 
     @abc.abstractmethod
-    def explore(self, params: Any, obs: jax.Array, key: jax.Array) -> jax.Array:
-        """Actions `[B, action_size]` of the policy with exploration noise."""
+    def explore(
+        self, params: Params, obs: Float[Array, "B observation_size"], key: PRNGKeyArray
+    ) -> Float[Array, "B action_size"]:
+        """Actions of the policy with exploration noise."""
 
     @abc.abstractmethod
-    def critic_update(self, learner: Any, batch: Batch, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+    def critic_update(self, learner: LearnerT, batch: Batch, key: PRNGKeyArray) -> tuple[LearnerT, Losses]:
         """One gradient step on the critics: `(learner, metrics)`."""
 
     @abc.abstractmethod
-    def full_update(self, learner: Any, batch: Batch, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+    def full_update(self, learner: LearnerT, batch: Batch, key: PRNGKeyArray) -> tuple[LearnerT, Losses]:
         """One gradient step on critics and policy: `(learner, metrics)`."""
 
     # What all of them do.
@@ -131,28 +112,30 @@ class OffPolicyAlgorithm(Algorithm):
         return self.buffer.num_bytes
 
     def apply_gradients(
-        self, params: Any, grads: Any, optimizer: optax.OptState, rate: jax.Array | float
-    ) -> tuple[Any, optax.OptState]:
+        self, params: _ParamsT, grads: _ParamsT, optimizer: optax.OptState, rate: Float[Array, ""] | float
+    ) -> tuple[_ParamsT, optax.OptState]:
         """One gradient step: parameters and optimizer state after it."""
         return apply_gradients(self.optimizer, params, grads, optimizer, rate, self.axis_name)
 
-    def normalize(self, normalizer: RunningStatisticsState, obs: jax.Array) -> jax.Array:
+    def normalize(
+        self, normalizer: RunningStatisticsState, obs: Float[Array, "*batch observation_size"]
+    ) -> Float[Array, "*batch observation_size"]:
         """Normalised and clipped observations."""
         return running_statistics.normalize(obs, normalizer, max_abs_value=self.config.observation_clip)
 
-    def policy_params(self, state: OffPolicyState) -> Any:
+    def policy_params(self, state: OffPolicyState[LearnerT]) -> PolicyParams:
         return (state.normalizer, state.learner.policy)
 
-    def policy(self, policy_params: Any, deterministic: bool = True) -> PolicyFn:
+    def policy(self, policy_params: PolicyParams, deterministic: bool = True) -> PolicyFn:
         normalizer, params = policy_params
 
-        def act(obs: jax.Array, key: jax.Array) -> jax.Array:
+        def act(obs: Float[Array, "B observation_size"], key: PRNGKeyArray) -> Float[Array, "B action_size"]:
             action = self.act(params, self.normalize(normalizer, obs), key, deterministic)
             return self.task.scale_action(action)
 
         return act
 
-    def init(self, key: jax.Array) -> OffPolicyState:
+    def init(self, key: PRNGKeyArray) -> OffPolicyState[LearnerT]:
         learner_key, env_key, noise_key, key = jax.random.split(key, 4)
         learner = self.init_learner(learner_key)
         normalizer = networks.init_normalizer(self.task.observation_size)
@@ -170,7 +153,7 @@ class OffPolicyAlgorithm(Algorithm):
             noise_key=noise_key,
         )
 
-    def collect(self, state: OffPolicyState) -> tuple[OffPolicyState, tuple[Steps, Metrics]]:
+    def collect(self, state: OffPolicyState[LearnerT]) -> tuple[OffPolicyState[LearnerT], tuple[Steps, Metrics]]:
         config = self.config
         key, pool_key = jax.random.split(state.key)
         step = state.iterations * config.unroll_length + jnp.arange(config.unroll_length)
@@ -180,7 +163,9 @@ class OffPolicyAlgorithm(Algorithm):
         env, evaluation, steps, metrics = rollout.unroll(self.env, env, evaluation, actor, noise_keys, _keep)
         return state.replace(env=env, evaluation=evaluation, key=key), (steps, metrics | scores)
 
-    def _explore(self, state: OffPolicyState, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _explore(
+        self, state: OffPolicyState[LearnerT], obs: Float[Array, "B observation_size"], key: PRNGKeyArray
+    ) -> tuple[Float[Array, "B action_size"], Float[Array, "B action_size"]]:
         """Gymnasium's action and the networks'; uniformly random before learning starts."""
         is_random = state.iterations * float(self.steps_per_iteration) < self.config.learning_starts
         explore_key, uniform_key = jax.random.split(key)
@@ -189,7 +174,9 @@ class OffPolicyAlgorithm(Algorithm):
         action = jnp.where(is_random, uniform, chosen)
         return self.task.scale_action(action), action
 
-    def learn(self, state: OffPolicyState, batch: tuple[Steps, Metrics]) -> tuple[OffPolicyState, Metrics]:
+    def learn(
+        self, state: OffPolicyState[LearnerT], batch: tuple[Steps, Metrics]
+    ) -> tuple[OffPolicyState[LearnerT], Metrics]:
         config = self.config
         steps, env_metrics = batch
         key, update_key = jax.random.split(state.key)
@@ -232,10 +219,10 @@ class OffPolicyAlgorithm(Algorithm):
         settings: functools.partial[Batch],
         replay: Replay,
         normalizer: RunningStatisticsState,
-        discount: jax.Array | float,
-        key: jax.Array,
-        learner: Any,
-    ) -> tuple[Any, dict[str, jax.Array]]:
+        discount: Float[Array, ""] | float,
+        key: PRNGKeyArray,
+        learner: LearnerT,
+    ) -> tuple[LearnerT, Losses]:
         """All updates of an iteration: `policy_delay` critic updates at a time, the last of them with the policy's."""
         config = self.config
 
@@ -268,7 +255,7 @@ def _keep(step: rollout.Step) -> Steps:
     return Steps(step.obs, step.extras, outcome.reward, outcome.terminated, outcome.truncated, outcome.obs)
 
 
-def _wait(train: Any, learner: Any) -> tuple[Any, dict[str, jax.Array]]:
+def _wait(train: Callable[[LearnerT], tuple[LearnerT, Losses]], learner: LearnerT) -> tuple[LearnerT, Losses]:
     """The learner as it is, and zeros for metrics, before learning starts."""
     shapes = jax.eval_shape(train, learner)[1]
     return learner, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)

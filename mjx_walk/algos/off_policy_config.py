@@ -5,6 +5,8 @@ import dataclasses
 from mjx_walk.common import networks
 from mjx_walk.utils.setting_fields import AnyBut, setting
 
+__all__ = ["OffPolicyConfig"]
+
 
 @dataclasses.dataclass
 class OffPolicyConfig:

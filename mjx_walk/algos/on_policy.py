@@ -3,7 +3,8 @@
 import dataclasses
 import functools
 import math
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import ClassVar, TypeVar
 
 import flax
 import jax
@@ -11,16 +12,22 @@ import jax.numpy as jnp
 import optax
 from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.agents.ppo import networks as brax_ppo_networks
+from jax import Array
+from jaxtyping import Bool, Float, PRNGKeyArray, Shaped
 
 from mjx_walk.algos.base import Algorithm, TrainState
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.common import networks, returns, rollout
-from mjx_walk.common.brax_losses import PPOParams, on_policy_transition
+from mjx_walk.common.brax_losses import PolicyExtras, PPOParams, on_policy_transition
 from mjx_walk.common.exploration import Exploration, NoExploration
 from mjx_walk.common.optimizers import adapt_rate, apply_gradients, make_adam, remaining_fraction, schedule_factor
 from mjx_walk.utils import collectives
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.types import PER_DEVICE, Metrics, PolicyFn, Transition
+from mjx_walk.utils.types import PER_DEVICE, Metrics, PolicyFn, PolicyParams, Transition
+
+__all__ = ["OnPolicyAlgorithm", "OnPolicyBatch", "OnPolicyState", "require_several_gradient_steps"]
+
+_OnPolicyConfigT = TypeVar("_OnPolicyConfigT", bound=OnPolicyConfig)
 
 
 class OnPolicyState(TrainState):
@@ -28,11 +35,11 @@ class OnPolicyState(TrainState):
 
     params: PPOParams
     optimizer: optax.OptState
-    learning_rate: jax.Array
+    learning_rate: Array
     """`[] f32`: of the policy; constant unless it adapts to the KL."""
     normalizer: RunningStatisticsState
     return_scale: returns.ReturnScale
-    exploration: Any = flax.struct.field(metadata=PER_DEVICE)
+    exploration: Array | tuple[()] = flax.struct.field(metadata=PER_DEVICE)
     """State of the exploration noise; empty without noise."""
 
 
@@ -42,16 +49,16 @@ class OnPolicyBatch(flax.struct.PyTreeNode):
     transitions: Transition
     """`[N, T, …]`. What Brax's PPO loss does not read is left out: `action` is empty (the raw action is in `extras`),
     and `next_observation` holds the last step's only, `[N, 1, …]`."""
-    rewards: jax.Array
+    rewards: Array
     """`[T·U, B]`, as the environment gave them, in chronological order."""
-    ended: jax.Array
+    ended: Array
     """`[T·U, B] bool`: an episode ended at this step."""
-    reward_scale: jax.Array
+    reward_scale: Array
     metrics: Metrics
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class OnPolicyAlgorithm(Algorithm):
+class OnPolicyAlgorithm(Algorithm[OnPolicyState, OnPolicyBatch, _OnPolicyConfigT]):
     """Collects unrolls of the present policy. Subclasses define `update`.
 
     The first batches only measure the scale of observations and rewards. Without that scale the policy that learns
@@ -62,7 +69,6 @@ class OnPolicyAlgorithm(Algorithm):
     """Whether there is a value network. With one, time limits are bootstrapped through, and `update` sees a truncated
     step as a terminated one; without, it sees `truncation`."""
 
-    config: OnPolicyConfig
     nets: brax_ppo_networks.PPONetworks = dataclasses.field(init=False, repr=False)
     optimizer: optax.GradientTransformation = dataclasses.field(init=False, repr=False)
     exploration: Exploration = dataclasses.field(init=False, repr=False)
@@ -89,14 +95,14 @@ class OnPolicyAlgorithm(Algorithm):
         steps = self.config.unroll_length * self.config.num_unrolls
         return math.ceil(self.config.normalizer_warmup_steps_per_env / steps)
 
-    def policy_params(self, state: OnPolicyState) -> Any:
+    def policy_params(self, state: OnPolicyState) -> PolicyParams:
         return (state.normalizer, state.params.policy)
 
-    def policy(self, policy_params: Any, deterministic: bool = True) -> PolicyFn:
+    def policy(self, policy_params: PolicyParams, deterministic: bool = True) -> PolicyFn:
         act = brax_ppo_networks.make_inference_fn(self.nets)(policy_params, deterministic=deterministic)
         return lambda obs, key: self.task.scale_action(act(obs, key)[0])
 
-    def init(self, key: jax.Array) -> OnPolicyState:
+    def init(self, key: PRNGKeyArray) -> OnPolicyState:
         policy_key, value_key, env_key, key = jax.random.split(key, 4)
         params = PPOParams(
             policy=self.nets.policy_network.init(policy_key),
@@ -149,20 +155,25 @@ class OnPolicyAlgorithm(Algorithm):
         )
         return state.replace(env=env, evaluation=evaluation, exploration=exploration, key=key), batch
 
-    def reward_scale(self, state: OnPolicyState) -> jax.Array:
-        """The factor of the rewards, `[] f32`."""
+    def reward_scale(self, state: OnPolicyState) -> Float[Array, ""]:
+        """The factor of the rewards."""
         scale = jnp.float32(self.config.reward_scale)
         return scale * returns.reward_multiplier(state.return_scale) if self.config.normalize_rewards else scale
 
-    def _act(self, sample: PolicyFn, obs: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
+    def _act(
+        self,
+        sample: Callable[[Array, PRNGKeyArray], tuple[Array, PolicyExtras]],
+        obs: Float[Array, "B observation_size"],
+        inputs: tuple[PRNGKeyArray, Float[Array, "B action_size"] | Float[Array, ""]],
+    ) -> tuple[Float[Array, "B action_size"], PolicyExtras]:
         """Gymnasium's action, with exploration noise, and what the loss needs of the sample."""
         key, noise = inputs
         action, extras = sample(obs, key)
         return self.task.scale_action(action + noise), extras
 
     def _keep(
-        self, state: OnPolicyState, reward_scale: jax.Array, step: rollout.Step
-    ) -> tuple[Transition, jax.Array, jax.Array]:
+        self, state: OnPolicyState, reward_scale: Float[Array, ""], step: rollout.Step
+    ) -> tuple[Transition, Float[Array, " B"], Bool[Array, " B"]]:
         """The transition to learn from; the reward; and whether the episode ended."""
         outcome = step.outcome
         truncated = outcome.truncated & ~outcome.terminated
@@ -174,8 +185,10 @@ class OnPolicyAlgorithm(Algorithm):
         transition = on_policy_transition(step.obs, reward, terminated, truncated, step.extras)
         return transition, outcome.reward, outcome.terminated | outcome.truncated
 
-    def _lost_value(self, state: OnPolicyState, obs: jax.Array, truncated: jax.Array) -> jax.Array:
-        """Values of the observations that a time limit cut off, `[B]`; computed only in steps that have any."""
+    def _lost_value(
+        self, state: OnPolicyState, obs: Float[Array, "B observation_size"], truncated: Bool[Array, " B"]
+    ) -> Float[Array, " B"]:
+        """Values of the observations that a time limit cut off; computed only in steps that have any."""
         return jax.lax.cond(
             truncated.any(),
             lambda obs: self.nets.value_network.apply(state.normalizer, state.params.value, obs),
@@ -183,11 +196,11 @@ class OnPolicyAlgorithm(Algorithm):
             obs,
         )
 
-    def update(self, state: Any, batch: OnPolicyBatch) -> tuple[Any, Metrics]:
+    def update(self, state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         """Learn from a batch: `(state, batch) → (state, metrics)`."""
         raise NotImplementedError
 
-    def learn(self, state: Any, batch: OnPolicyBatch) -> tuple[Any, Metrics]:
+    def learn(self, state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         learned, metrics = self.update(state, batch)
         is_warmup = state.iterations < self.num_warmup_batches
         old = (state.params, state.optimizer, state.learning_rate)
@@ -196,11 +209,11 @@ class OnPolicyAlgorithm(Algorithm):
         known = {name: metric.only_if(~is_warmup) for name, metric in metrics.items() if name not in batch.metrics}
         return learned.replace(params=kept[0], optimizer=kept[1], learning_rate=kept[2]), metrics | known
 
-    def remaining(self, state: OnPolicyState) -> jax.Array:
+    def remaining(self, state: OnPolicyState) -> Float[Array, ""]:
         """The fraction of the schedules that is left."""
         return remaining_fraction(state.iterations * float(self.steps_per_iteration), self.config.schedule_steps)
 
-    def learning_rates(self, state: OnPolicyState, remaining: jax.Array) -> PPOParams:
+    def learning_rates(self, state: OnPolicyState, remaining: Float[Array, ""]) -> PPOParams:
         """Learning rates of policy and value network."""
         factor = schedule_factor(self.config.learning_rate_schedule, remaining)
         return PPOParams(policy=state.learning_rate * factor, value=self.config.learning_rate * factor)
@@ -222,8 +235,8 @@ class OnPolicyAlgorithm(Algorithm):
         params: PPOParams,
         optimizer: optax.OptState,
         normalizer: RunningStatisticsState,
-        kl: jax.Array,
-        key: jax.Array,
+        kl: Float[Array, ""],
+        key: PRNGKeyArray,
     ) -> OnPolicyState:
         """The state after an update. A learning rate under `adaptive_kl` follows the KL at the end of the update."""
         rate = state.learning_rate
@@ -242,8 +255,8 @@ class OnPolicyAlgorithm(Algorithm):
         )
 
 
-def _unrolls_first(x: jax.Array) -> jax.Array:
-    """`[U, T, B, …]` to `[U·B, T, …]`."""
+def _unrolls_first(x: Shaped[Array, "U T B *rest"]) -> Shaped[Array, "U*B T *rest"]:
+    """One axis of unrolls and environments, before that of steps."""
     x = jnp.swapaxes(x, 1, 2)
     return x.reshape((-1, *x.shape[2:]))
 

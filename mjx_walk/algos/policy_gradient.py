@@ -1,25 +1,38 @@
 """What A2C and REINFORCE share: one pass over a batch with the plain policy gradient."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import optax
 from brax.training.acme.running_statistics import RunningStatisticsState
+from jax import Array
+from jaxtyping import Float, PRNGKeyArray
 
 from mjx_walk.algos.on_policy import (
     OnPolicyAlgorithm,
     OnPolicyBatch,
-    OnPolicyConfig,
     OnPolicyState,
     require_several_gradient_steps,
 )
+from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.common.brax_losses import PPOParams
 from mjx_walk.common.optimizers import schedule_factor
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
-from mjx_walk.utils.types import Metrics, as_means
+from mjx_walk.utils.types import Losses, Metrics, as_means
+
+__all__ = [
+    "MAX_IMPORTANCE",
+    "PolicyGradientAlgorithm",
+    "PolicyGradientConfig",
+    "Samples",
+    "normalize",
+    "out_of_bounds",
+    "policy_gradient_loss",
+    "sampled_kl",
+]
 
 MAX_IMPORTANCE = 10.0
 """Upper bound of importance weights."""
@@ -41,26 +54,27 @@ class PolicyGradientConfig(OnPolicyConfig):
 class Samples(NamedTuple):
     """Steps to learn from, `[T, N, …]` or `[N, T, …]`; of a minibatch, `[S, …]`."""
 
-    observation: jax.Array
-    raw_action: jax.Array
-    acted_log_prob: jax.Array
+    observation: Array
+    raw_action: Array
+    acted_log_prob: Array
     """Log-probability under the policy that acted."""
-    advantage: jax.Array
-    weight: jax.Array
+    advantage: Array
+    weight: Array
     """0 for steps that do not count."""
-    target: jax.Array | tuple[()]
+    target: Array | tuple[()]
     """Target of the value network; empty where there is none."""
 
 
+_PolicyGradientConfigT = TypeVar("_PolicyGradientConfigT", bound=PolicyGradientConfig)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
-class PolicyGradientAlgorithm(OnPolicyAlgorithm):
+class PolicyGradientAlgorithm(OnPolicyAlgorithm[_PolicyGradientConfigT]):
     """Uses each step of a batch for one gradient step. Subclasses define `samples`.
 
     Raises:
         UserError: fewer steps than minibatches; or see `require_several_gradient_steps`.
     """
-
-    config: PolicyGradientConfig
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -80,7 +94,7 @@ class PolicyGradientAlgorithm(OnPolicyAlgorithm):
 
     def value_loss(
         self, params: PPOParams, normalizer: RunningStatisticsState, samples: Samples
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+    ) -> tuple[Float[Array, ""], Losses]:
         """The loss of the value network, and metrics; zero where there is none."""
         return jnp.float32(0.0), {}
 
@@ -125,9 +139,9 @@ class PolicyGradientAlgorithm(OnPolicyAlgorithm):
         params: PPOParams,
         normalizer: RunningStatisticsState,
         part: Samples,
-        entropy_coef: jax.Array | float,
-        key: jax.Array,
-    ) -> tuple[jax.Array, dict[str, Any]]:
+        entropy_coef: Float[Array, ""] | float,
+        key: PRNGKeyArray,
+    ) -> tuple[Float[Array, ""], Losses]:
         """The loss of a minibatch, and metrics."""
         distribution = self.nets.parametric_action_distribution
         logits = self.nets.policy_network.apply(normalizer, params.policy, part.observation)
@@ -145,8 +159,10 @@ class PolicyGradientAlgorithm(OnPolicyAlgorithm):
         return total, metrics
 
 
-def policy_gradient_loss(log_prob: jax.Array, acted_log_prob: jax.Array, advantages: jax.Array) -> jax.Array:
-    """Minus the advantage times the log-probability, `[…]`, weighted by the action's importance weight.
+def policy_gradient_loss(
+    log_prob: Float[Array, "*steps"], acted_log_prob: Float[Array, "*steps"], advantages: Float[Array, "*steps"]
+) -> Float[Array, "*steps"]:
+    """Minus the advantage times the log-probability, weighted by the action's importance weight.
 
     At the first gradient step of a batch the weight is 1. Without it, the gradient pushes a bad action away the harder
     the less likely that action already is, and a few steps move the policy far. A bound of 1, as in IMPALA, would leave
@@ -156,22 +172,22 @@ def policy_gradient_loss(log_prob: jax.Array, acted_log_prob: jax.Array, advanta
     return -weight * advantages * log_prob
 
 
-def out_of_bounds(mean: jax.Array) -> jax.Array:
-    """Squared distance of means `[…, action_size]` from [-1, 1], summed over an action, averaged over actions.
+def out_of_bounds(mean: Float[Array, "*steps action_size"]) -> Float[Array, ""]:
+    """Squared distance of means from [-1, 1], summed over an action, averaged over actions.
 
     Outside this range the samples are clipped, so no return depends on the mean, and it drifts.
     """
     return jnp.square(jnp.maximum(jnp.abs(mean) - 1.0, 0.0)).sum(axis=-1).mean()
 
 
-def normalize(values: jax.Array, weight: jax.Array) -> jax.Array:
+def normalize(values: Float[Array, "*steps"], weight: Float[Array, "*steps"]) -> Float[Array, "*steps"]:
     """Values with mean 0 and standard deviation 1 over those that count."""
     total = jnp.maximum(weight.sum(), 1.0)
     centred = values - (weight * values).sum() / total
     return centred / jnp.sqrt((weight * centred**2).sum() / total + 1e-8)
 
 
-def sampled_kl(log_prob: jax.Array, acted_log_prob: jax.Array) -> jax.Array:
+def sampled_kl(log_prob: Float[Array, "*steps"], acted_log_prob: Float[Array, "*steps"]) -> Float[Array, ""]:
     """Estimate of the KL from the policy that acted, from its own samples: `r - 1 - log r`, never negative.
 
     Source: Schulman 2020, "Approximating KL divergence", the third estimator.

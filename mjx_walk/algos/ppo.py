@@ -2,24 +2,27 @@
 
 import dataclasses
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
+from jax import Array
+from jaxtyping import Float
 
 from mjx_walk.algos.on_policy import (
     OnPolicyAlgorithm,
     OnPolicyBatch,
-    OnPolicyConfig,
     OnPolicyState,
     require_several_gradient_steps,
 )
+from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.common.brax_losses import make_ppo_loss
 from mjx_walk.common.optimizers import schedule_factor
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
-from mjx_walk.utils.types import Metrics, as_means
+from mjx_walk.utils.types import Losses, Metrics, as_means
+
+__all__ = ["PPO", "PPOConfig"]
 
 
 @dataclasses.dataclass
@@ -36,14 +39,12 @@ class PPOConfig(OnPolicyConfig):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class PPO(OnPolicyAlgorithm):
+class PPO(OnPolicyAlgorithm[PPOConfig]):
     """Several epochs of minibatches on Brax's clipped loss.
 
     Raises:
         UserError: the batch cannot be split evenly into minibatches; or see `require_several_gradient_steps`.
     """
-
-    config: PPOConfig
 
     def __post_init__(self) -> None:
         _require_even_minibatches(self.num_envs, self.config.num_unrolls, self.config.num_minibatches)
@@ -93,7 +94,9 @@ class PPO(OnPolicyAlgorithm):
         )
 
 
-def _loss_metrics(metrics: dict[str, Any]) -> dict[str, jax.Array]:
+def _loss_metrics(
+    metrics: dict[str, Float[Array, "epochs minibatches"]],
+) -> Losses:
     """Means of Brax's metrics over all minibatches, under our names."""
     names = {
         "total_loss": "loss",

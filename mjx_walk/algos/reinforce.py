@@ -6,6 +6,8 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 
 from mjx_walk.algos.on_policy import OnPolicyBatch, OnPolicyState
 from mjx_walk.algos.policy_gradient import PolicyGradientAlgorithm, PolicyGradientConfig, Samples, normalize
@@ -13,6 +15,8 @@ from mjx_walk.common import returns
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
 from mjx_walk.utils.types import Metrics, as_means
+
+__all__ = ["REINFORCE", "REINFORCEConfig", "linear_fit", "standardize"]
 
 
 @dataclasses.dataclass
@@ -35,7 +39,7 @@ class REINFORCEConfig(PolicyGradientConfig):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class REINFORCE(PolicyGradientAlgorithm):
+class REINFORCE(PolicyGradientAlgorithm[REINFORCEConfig]):
     """The policy gradient on discounted returns.
 
     Deviation: environments do not wait for each other's episodes to end. A batch is one unroll of `unroll_length`
@@ -49,7 +53,6 @@ class REINFORCE(PolicyGradientAlgorithm):
 
     has_value: ClassVar[bool] = False
 
-    config: REINFORCEConfig
     num_learned: int = dataclasses.field(init=False)
     """Steps of an unroll that are learned from."""
 
@@ -100,19 +103,18 @@ _RIDGE = 1e-2
 """Small compared with the features' variance of 1, and large enough for duplicate features in float32."""
 
 
-def linear_fit(obs: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
+def linear_fit(
+    obs: Float[Array, "N T observation_size"], target: Float[Array, "N T"], weight: Float[Array, "N T"]
+) -> Float[Array, "N T"]:
     """Predictions of a least-squares fit of the target to observations and their squares.
 
     Source: the baseline of REINFORCE in Duan et al. 2016, "Benchmarking deep reinforcement learning for continuous
     control". Deviations: no powers of time, since nothing in these tasks depends on it; fitted to the batch itself.
 
     Args:
-        obs: `[N, T, observation_size]`, unnormalized.
-        target: `[N, T]`, of mean 0.
-        weight: `[N, T]`, 0 where a target does not count.
-
-    Returns:
-        `[N, T]`.
+        obs: unnormalized.
+        target: of mean 0.
+        weight: 0 where a target does not count.
     """
     linear = standardize(obs)
     features = jnp.concatenate([linear, standardize(jnp.square(linear))], axis=-1)
@@ -123,7 +125,7 @@ def linear_fit(obs: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Arra
     return product("ntf,f->nt", features, jax.scipy.linalg.solve(gram, moment, assume_a="pos"))
 
 
-def standardize(features: jax.Array) -> jax.Array:
+def standardize(features: Float[Array, "N T features"]) -> Float[Array, "N T features"]:
     """Features with mean 0 and std 1 over all but the last axis, clipped; constant features become 0."""
     mean, std = features.mean(axis=(0, 1)), features.std(axis=(0, 1))
     return jnp.clip((features - mean) / (std + 1e-4), -_LARGEST, _LARGEST)

@@ -1,21 +1,25 @@
 """Soft actor-critic (Haarnoja et al. 2018) on Brax's networks and losses."""
 
 import dataclasses
-from typing import Any
 
 import flax
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training import types as brax_types
 from brax.training.agents.sac.networks import SACNetworks
+from jax import Array
+from jaxtyping import Float, PRNGKeyArray
 
-from mjx_walk.algos.off_policy import Batch, OffPolicyAlgorithm
+from mjx_walk.algos.off_policy import OffPolicyAlgorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
+from mjx_walk.algos.off_policy_state import Batch
 from mjx_walk.common import networks
 from mjx_walk.common.brax_losses import SACLosses, make_sac_losses
 from mjx_walk.common.optimizers import polyak_update
 from mjx_walk.utils.setting_fields import AnyBut, setting
+from mjx_walk.utils.types import Losses, Params
+
+__all__ = ["SAC", "SACConfig", "SACState"]
 
 
 @dataclasses.dataclass
@@ -46,17 +50,17 @@ class SACConfig(OffPolicyConfig):
 class SACState(flax.struct.PyTreeNode):
     """Networks and optimizers."""
 
-    policy: brax_types.Params
-    critic: brax_types.Params
-    target_critic: brax_types.Params
-    log_alpha: jax.Array
+    policy: Params
+    critic: Params
+    target_critic: Params
+    log_alpha: Array
     policy_optimizer: optax.OptState
     critic_optimizer: optax.OptState
     alpha_optimizer: optax.OptState
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class SAC(OffPolicyAlgorithm):
+class SAC(OffPolicyAlgorithm[SACState, SACConfig]):
     """Soft actor-critic.
 
     Source: `sgd_step` of Brax's SAC: temperature, critic and policy take their gradients at the same parameters.
@@ -73,7 +77,7 @@ class SAC(OffPolicyAlgorithm):
         """Policy and critics."""
         return networks.make_sac_networks(self.task, self.config)
 
-    def init_learner(self, key: jax.Array) -> SACState:
+    def init_learner(self, key: PRNGKeyArray) -> SACState:
         policy_key, critic_key = jax.random.split(key)
         policy, critic = self.nets.policy_network.init(policy_key), self.nets.q_network.init(critic_key)
         log_alpha = jnp.log(jnp.float32(self.config.init_alpha))
@@ -87,12 +91,16 @@ class SAC(OffPolicyAlgorithm):
             alpha_optimizer=self.optimizer.init(log_alpha),
         )
 
-    def act(self, params: Any, obs: jax.Array, key: jax.Array, deterministic: bool) -> jax.Array:
+    def act(
+        self, params: Params, obs: Float[Array, "B observation_size"], key: PRNGKeyArray, deterministic: bool
+    ) -> Float[Array, "B action_size"]:
         logits = self.nets.policy_network.apply(None, params, obs)
         distribution = self.nets.parametric_action_distribution
         return distribution.mode(logits) if deterministic else distribution.sample(logits, key)
 
-    def explore(self, params: Any, obs: jax.Array, key: jax.Array) -> jax.Array:
+    def explore(
+        self, params: Params, obs: Float[Array, "B observation_size"], key: PRNGKeyArray
+    ) -> Float[Array, "B action_size"]:
         return self.act(params, obs, key, deterministic=False)
 
     def losses(self, batch: Batch) -> SACLosses:
@@ -102,13 +110,13 @@ class SAC(OffPolicyAlgorithm):
         return make_sac_losses(self.nets, batch.reward_scale, target_entropy, self.task.action_size)
 
     def critic_loss(
-        self, critic: Any, learner: SACState, batch: Batch, key: jax.Array
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The loss of the critics, `[] f32`, and metrics."""
+        self, critic: Params, learner: SACState, batch: Batch, key: PRNGKeyArray
+    ) -> tuple[Float[Array, ""], Losses]:
+        """The loss of the critics, and metrics."""
         alpha, losses = jnp.exp(learner.log_alpha), self.losses(batch)
         return losses.critic(critic, learner.policy, learner.target_critic, alpha, batch.transitions, key), {}
 
-    def critic_update(self, learner: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, dict[str, jax.Array]]:
+    def critic_update(self, learner: SACState, batch: Batch, key: PRNGKeyArray) -> tuple[SACState, Losses]:
         of_critics = jax.value_and_grad(self.critic_loss, has_aux=True)
         (loss, metrics), grads = of_critics(learner.critic, learner, batch, key)
         rate = self.config.critic_learning_rate * batch.rate_factor
@@ -120,7 +128,7 @@ class SAC(OffPolicyAlgorithm):
         )
         return new_learner, metrics | {"critic_loss": loss, "critic_grad_norm": optax.global_norm(grads)}
 
-    def full_update(self, learner: SACState, batch: Batch, key: jax.Array) -> tuple[SACState, dict[str, jax.Array]]:
+    def full_update(self, learner: SACState, batch: Batch, key: PRNGKeyArray) -> tuple[SACState, Losses]:
         config, losses = self.config, self.losses(batch)
         alpha_key, critic_key, policy_key = jax.random.split(key, 3)
         alpha_grad = jax.grad(losses.temperature)(learner.log_alpha, learner.policy, batch.transitions, alpha_key)

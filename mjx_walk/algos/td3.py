@@ -6,6 +6,8 @@ from typing import ClassVar
 from mjx_walk.algos.deterministic import DeterministicAlgorithm, DeterministicConfig
 from mjx_walk.utils.setting_fields import AnyBut, setting
 
+__all__ = ["TD3", "TD3Config"]
+
 
 @dataclasses.dataclass
 class TD3Config(DeterministicConfig):
@@ -20,12 +22,10 @@ class TD3Config(DeterministicConfig):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class TD3(DeterministicAlgorithm):
+class TD3(DeterministicAlgorithm[TD3Config]):
     """Two critics, smoothed targets, and a policy that moves every `policy_delay` critic updates."""
 
     num_critics: ClassVar[int] = 2
-
-    config: TD3Config
 
     @property
     def target_noise(self) -> tuple[float, float]:

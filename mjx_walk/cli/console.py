@@ -92,7 +92,7 @@ def _is_not_about_gpus(record: logging.LogRecord) -> bool:
     return not record.getMessage().startswith(("An NVIDIA GPU may be present", "CUDA backend failed to initialize"))
 
 
-def _say_nothing_of_interrupts(unraisable: Any) -> None:
+def _say_nothing_of_interrupts(unraisable: "sys.UnraisableHookArgs") -> None:
     """Hide a Ctrl-C that meets code which cannot raise, such as a callback of the garbage collector."""
     if not (unraisable.exc_type and issubclass(unraisable.exc_type, KeyboardInterrupt)):
         sys.__unraisablehook__(unraisable)

@@ -88,7 +88,7 @@ def parse(schema: type[Arguments], arguments: list[str], usage: str) -> Argument
 
 def parse_own(
     schema: type[Arguments],
-    others: type[Any],
+    others: type[object],
     arguments: list[str],
     usage: str,
     key_of: Callable[[str], str | None] = lambda value: None,
@@ -124,7 +124,7 @@ def parse_own(
 def refuse_flags(
     arguments: list[str],
     key_of: Callable[[str], str | None] = lambda value: None,
-    hints: Mapping[str, Any] | None = None,
+    hints: Mapping[str, object] | None = None,
 ) -> None:
     """Check that every argument is `key=value`, and say how to write one that is not: `--num_envs 5`, `env humanoid`.
 
@@ -152,7 +152,7 @@ def refuse_flags(
         raise UserError(f"cannot read '{given}'; write {wanted if is_key else 'KEY=VALUE'}")
 
 
-def _as_override(key: str, value: str, hints: Mapping[str, Any] | None) -> str:
+def _as_override(key: str, value: str, hints: Mapping[str, object] | None) -> str:
     """`num_envs=5` for `--num-envs` and `5`, or the general form if no such key is known."""
     name, colon, after = key.lstrip("-").replace("-", "_").partition(":")
     if hints is not None and name not in hints and "." not in name:
@@ -164,7 +164,7 @@ def _as_override(key: str, value: str, hints: Mapping[str, Any] | None) -> str:
     return f"{name}={value or (after if colon else '') or default}"
 
 
-def _key_of_value(schema: Any, value: str) -> str | None:
+def _key_of_value(schema: type, value: str) -> str | None:
     """The key whose choices a value is one of, or `run`, for a value that is given alone."""
     fields = {field.name: field.metadata.get("choices", ()) for field in dataclasses.fields(schema)}
     fitting = [name for name, choices in fields.items() if value in choices]

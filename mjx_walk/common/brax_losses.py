@@ -2,24 +2,54 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Protocol, runtime_checkable
 
-import jax
 import jax.numpy as jnp
 from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo.networks import PPONetworks
 from brax.training.agents.sac import losses as sac_losses
 from brax.training.agents.sac.networks import SACNetworks
+from jax import Array
+from jaxtyping import Bool, Float
 
-from mjx_walk.utils.types import Transition
+from mjx_walk.utils.types import Losses, Transition
+
+__all__ = [
+    "PPOLossConfig",
+    "PPOParams",
+    "PolicyExtras",
+    "SACLosses",
+    "compute_gae",
+    "make_ppo_loss",
+    "make_sac_losses",
+    "on_policy_transition",
+]
 
 PPOParams = ppo_losses.PPONetworkParams
 """Parameters of policy and value network."""
 
+PolicyExtras = Mapping[str, Array]
+"""Raw actions, their log-probabilities and the distribution's parameters, by Brax's names."""
+
+
+@runtime_checkable
+class PPOLossConfig(Protocol):
+    """Settings of Brax's PPO loss; `PPOConfig` documents them."""
+
+    discount: float
+    gae_lambda: float
+    clip_epsilon: float
+    normalize_advantages: bool
+    value_loss_coef: float
+
 
 def on_policy_transition(
-    obs: jax.Array, reward: jax.Array, terminated: jax.Array, truncated: jax.Array, policy_extras: Any
+    obs: Float[Array, "B observation_size"],
+    reward: Float[Array, " B"],
+    terminated: Bool[Array, " B"],
+    truncated: Bool[Array, " B"],
+    policy_extras: PolicyExtras,
 ) -> Transition:
     """A step as Brax's PPO loss reads it; what it does not read is empty.
 
@@ -36,13 +66,13 @@ def on_policy_transition(
 
 
 def make_ppo_loss(
-    nets: PPONetworks, config: Any, entropy_coef: jax.Array | float, reward_scale: jax.Array
-) -> Callable[..., tuple[jax.Array, dict[str, jax.Array]]]:
+    nets: PPONetworks, config: PPOLossConfig, entropy_coef: Float[Array, ""] | float, reward_scale: Float[Array, ""]
+) -> Callable[..., tuple[Float[Array, ""], Losses]]:
     """`(params, normalizer, transitions [N, T, …], key) → (loss, metrics)`.
 
     Args:
         nets: policy and value network.
-        config: `PPOConfig`.
+        config: settings of the loss.
         entropy_coef: coefficient of the entropy bonus.
         reward_scale: factor of the rewards.
     """
@@ -70,13 +100,13 @@ class SACLosses:
     and `policy(policy, critic, alpha, transitions, key)`, each `[] f32`.
     """
 
-    temperature: Callable[..., jax.Array]
-    critic: Callable[..., jax.Array]
-    policy: Callable[..., jax.Array]
+    temperature: Callable[..., Array]
+    critic: Callable[..., Array]
+    policy: Callable[..., Array]
 
 
 def make_sac_losses(
-    nets: SACNetworks, reward_scale: jax.Array, target_entropy: jax.Array | float, action_size: int
+    nets: SACNetworks, reward_scale: Float[Array, ""], target_entropy: Float[Array, ""] | float, action_size: int
 ) -> SACLosses:
     """Brax's SAC losses.
 

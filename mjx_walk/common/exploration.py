@@ -1,24 +1,32 @@
 """Exploration noise that an algorithm adds to the actions of its policy."""
 
 import dataclasses
-from typing import Any, Protocol
+from typing import Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, PRNGKeyArray
+
+__all__ = ["Exploration", "NoExploration", "OrnsteinUhlenbeck"]
+
+_NoiseT = TypeVar("_NoiseT")
 
 
-class Exploration(Protocol):
+class Exploration(Protocol[_NoiseT]):
     """Noise for unrolls of T steps, added to actions in `[-1, 1]`."""
 
-    def init(self, num_envs: int, action_size: int) -> Any:
+    def init(self, num_envs: int, action_size: int) -> _NoiseT:
         """The state of the noise before the first step."""
         ...
 
-    def unroll(self, state: Any, key: jax.Array, num_steps: int) -> tuple[Any, jax.Array, jax.Array]:
+    def unroll(
+        self, state: _NoiseT, key: PRNGKeyArray, num_steps: int
+    ) -> tuple[_NoiseT, Float[Array, "T B action_size"] | Float[Array, " T"], PRNGKeyArray]:
         """The noise of T steps.
 
         Returns:
-            The next state of the noise; the noise, `[T, B, action_size]` or `[T]`; and the key for the actions.
+            The next state of the noise; the noise; and the key for the actions.
         """
         ...
 
@@ -29,7 +37,9 @@ class NoExploration:
     def init(self, num_envs: int, action_size: int) -> tuple[()]:
         return ()
 
-    def unroll(self, state: tuple[()], key: jax.Array, num_steps: int) -> tuple[tuple[()], jax.Array, jax.Array]:
+    def unroll(
+        self, state: tuple[()], key: PRNGKeyArray, num_steps: int
+    ) -> tuple[tuple[()], Float[Array, " {num_steps}"], PRNGKeyArray]:
         return state, jnp.zeros(num_steps), key
 
 
@@ -45,17 +55,21 @@ class OrnsteinUhlenbeck:
     std: float
     theta: float
 
-    def init(self, num_envs: int, action_size: int) -> jax.Array:
-        """No noise, `[B, action_size]`."""
+    def init(self, num_envs: int, action_size: int) -> Float[Array, "{num_envs} {action_size}"]:
+        """No noise."""
         return jnp.zeros((num_envs, action_size))
 
-    def unroll(self, state: jax.Array, key: jax.Array, num_steps: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def unroll(
+        self, state: Float[Array, "B action_size"], key: PRNGKeyArray, num_steps: int
+    ) -> tuple[Float[Array, "B action_size"], Float[Array, "{num_steps} B action_size"], PRNGKeyArray]:
         key, noise_key = jax.random.split(key)
         noise = self.sequence(state, noise_key, num_steps)
         return noise[-1], noise, key
 
-    def sequence(self, noise: jax.Array, key: jax.Array, num_steps: int) -> jax.Array:
-        """The next T values after `noise` `[B, action_size]`, `[T, B, action_size]`."""
+    def sequence(
+        self, noise: Float[Array, "B action_size"], key: PRNGKeyArray, num_steps: int
+    ) -> Float[Array, "{num_steps} B action_size"]:
+        """The values of the next steps, after `noise`."""
 
         def advance(noise, gaussian):
             noise = (1.0 - self.theta) * noise + self.std * gaussian

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +13,26 @@ from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.sac import networks as sac_networks
 from brax.training.distribution import NormalDistribution, NormalTanhDistribution
 from brax.training.networks import ACTIVATION
+from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import Float, PRNGKeyArray
 
-from mjx_walk.envs import Task
+from mjx_walk.envs import TrainableTask
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.types import Params, PyTree
+
+__all__ = [
+    "ACTIVATIONS",
+    "MIN_OBSERVATION_STD",
+    "OffPolicyNetworkConfig",
+    "PPONetworkConfig",
+    "init_normalizer",
+    "make_critics",
+    "make_deterministic_networks",
+    "make_ppo_networks",
+    "make_sac_networks",
+    "update_normalizer",
+]
 
 ACTIVATIONS = tuple(name for name in ACTIVATION if name not in ("compact", "glu", "logsumexp", "one_hot"))
 """Names of activations. Brax's own list also has functions that change an array's shape or need more arguments."""
@@ -24,14 +41,39 @@ MIN_OBSERVATION_STD = 1e-4
 """Lower bound of an observation's std, so that near-constant ones such as a body's mass are not amplified."""
 
 
-def make_ppo_networks(task: Task, config: Any) -> ppo_networks.PPONetworks:
+class PPONetworkConfig(Protocol):
+    """Settings of PPO's networks; `OnPolicyConfig` documents them."""
+
+    policy_hidden_layer_sizes: tuple[int, ...]
+    value_hidden_layer_sizes: tuple[int, ...]
+    activation: str
+    distribution: str
+    """`tanh_normal`: state-dependent std, squashed; `normal`: unbounded, std dependent or not."""
+    init_noise_std: float
+    state_dependent_std: bool
+    min_log_std: float
+    max_log_std: float
+    observation_clip: float | None
+    network_dtype: str
+
+
+class OffPolicyNetworkConfig(Protocol):
+    """Settings of a policy and critics; `OffPolicyConfig` documents them."""
+
+    policy_hidden_layer_sizes: tuple[int, ...]
+    critic_hidden_layer_sizes: tuple[int, ...]
+    policy_layer_norm: bool
+    critic_layer_norm: bool
+    activation: str
+    network_dtype: str
+
+
+def make_ppo_networks(task: TrainableTask, config: PPONetworkConfig) -> ppo_networks.PPONetworks:
     """Policy and value network of Brax's PPO, for one task.
 
     Args:
         task: gives the sizes.
-        config: with `policy_hidden_layer_sizes`, `value_hidden_layer_sizes`, `activation`, `distribution`
-            (`tanh_normal`: state-dependent std, squashed; `normal`: unbounded, std dependent or not),
-            `init_noise_std`, `state_dependent_std`, `min_log_std`, `max_log_std`, `observation_clip`, `network_dtype`.
+        config: settings of the networks.
 
     Raises:
         UserError: the bounds of the std exclude each other.
@@ -70,7 +112,7 @@ def make_ppo_networks(task: Task, config: Any) -> ppo_networks.PPONetworks:
 class _BoundedNormal(NormalDistribution):
     """Brax's normal distribution with a bounded std."""
 
-    def __init__(self, event_size: int, config: Any):
+    def __init__(self, event_size: int, config: PPONetworkConfig):
         super().__init__(event_size)
         self._std_bounds = math.exp(config.min_log_std), math.exp(config.max_log_std)
 
@@ -80,14 +122,13 @@ class _BoundedNormal(NormalDistribution):
 
 
 def make_sac_networks(
-    task: Task, config: Any, critics: brax_networks.FeedForwardNetwork | None = None
+    task: TrainableTask, config: OffPolicyNetworkConfig, critics: brax_networks.FeedForwardNetwork | None = None
 ) -> sac_networks.SACNetworks:
     """Policy and critics of Brax's SAC, for one task, each of its own size, on normalized observations.
 
     Args:
         task: gives the sizes.
-        config: with `policy_hidden_layer_sizes`, `policy_layer_norm`, the same two for `critic`, `activation` and
-            `network_dtype`.
+        config: settings of the networks.
         critics: instead of the usual two; they give `[…, num_critics]`.
     """
     distribution = NormalTanhDistribution(event_size=task.action_size)
@@ -99,13 +140,15 @@ def make_sac_networks(
 
 
 def make_deterministic_networks(
-    task: Task, config: Any, num_critics: int
+    task: TrainableTask, config: OffPolicyNetworkConfig, num_critics: int
 ) -> tuple[brax_networks.FeedForwardNetwork, brax_networks.FeedForwardNetwork]:
     """A policy whose outputs the caller squashes by tanh, and critics; settings as for `make_sac_networks`."""
     return _policy_network(task.action_size, task, config), _scalar_critics(num_critics, task, config)
 
 
-def _policy_network(num_outputs: int, task: Task, config: Any) -> brax_networks.FeedForwardNetwork:
+def _policy_network(
+    num_outputs: int, task: TrainableTask, config: OffPolicyNetworkConfig
+) -> brax_networks.FeedForwardNetwork:
     network = brax_networks.make_policy_network(
         num_outputs,
         task.observation_size,
@@ -117,12 +160,16 @@ def _policy_network(num_outputs: int, task: Task, config: Any) -> brax_networks.
     return _compute_in(config.network_dtype, network)
 
 
-def _scalar_critics(num_critics: int, task: Task, config: Any) -> brax_networks.FeedForwardNetwork:
+def _scalar_critics(
+    num_critics: int, task: TrainableTask, config: OffPolicyNetworkConfig
+) -> brax_networks.FeedForwardNetwork:
     network = make_critics(num_critics, 1, task, config)
     return dataclasses.replace(network, apply=lambda *inputs: network.apply(*inputs)[..., 0])
 
 
-def make_critics(num_critics: int, num_outputs: int, task: Task, config: Any) -> brax_networks.FeedForwardNetwork:
+def make_critics(
+    num_critics: int, num_outputs: int, task: TrainableTask, config: OffPolicyNetworkConfig
+) -> brax_networks.FeedForwardNetwork:
     """Brax's critics with stacked parameters: one batched product instead of several small ones.
 
     Inputs are padded with zeros to a multiple of eight, without which a GPU's tensor cores cannot read their rows.
@@ -143,14 +190,19 @@ def make_critics(num_critics: int, num_outputs: int, task: Task, config: Any) ->
     )
     padding = -(task.observation_size + task.action_size) % 8
 
-    def init(key: jax.Array) -> Any:
+    def init(key: PRNGKeyArray) -> Params:
         inputs = jnp.zeros((1, task.observation_size + task.action_size))
         params = jax.vmap(critic.init, (0, None))(jax.random.split(key, num_critics), inputs)
         first = params["params"]["hidden_0"]
         first["kernel"] = jnp.pad(first["kernel"], ((0, 0), (0, padding), (0, 0)))
         return params
 
-    def apply(_: Any, params: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
+    def apply(
+        _: object,
+        params: Params,
+        obs: Float[Array, "*batch observation_size"],
+        action: Float[Array, "*batch action_size"],
+    ) -> Float[Array, "*batch num_critics num_outputs"]:
         inputs = jnp.concatenate([obs, action, jnp.zeros((*obs.shape[:-1], padding), obs.dtype)], axis=-1)
         return jax.vmap(critic.apply, (0, None), -2)(params, inputs.astype(config.network_dtype))
 
@@ -160,10 +212,10 @@ def make_critics(num_critics: int, num_outputs: int, task: Task, config: Any) ->
 def _compute_in(dtype: str, network: brax_networks.FeedForwardNetwork) -> brax_networks.FeedForwardNetwork:
     """A network that computes in `dtype`; it casts its inputs itself, and parameters and results are float32."""
 
-    def cast(tree: Any, dtype: Any) -> Any:
+    def cast(tree: PyTree, dtype: DTypeLike) -> PyTree:
         return jax.tree.map(lambda x: x.astype(dtype), tree)
 
-    def apply(normalizer: Any, params: Any, *inputs: jax.Array) -> Any:
+    def apply(normalizer: running_statistics.RunningStatisticsState | None, params: Params, *inputs: Array) -> PyTree:
         return cast(network.apply(normalizer, cast(params, dtype), *inputs), jnp.float32)
 
     return dataclasses.replace(network, apply=apply)
@@ -175,7 +227,9 @@ def init_normalizer(observation_size: int) -> running_statistics.RunningStatisti
 
 
 def update_normalizer(
-    normalizer: running_statistics.RunningStatisticsState, obs: jax.Array, axis_name: str | None = None
+    normalizer: running_statistics.RunningStatisticsState,
+    obs: Float[Array, "*batch observation_size"],
+    axis_name: str | None = None,
 ) -> running_statistics.RunningStatisticsState:
-    """Add `[…, observation_size]` observations, those of all devices, to the running statistics."""
+    """Add observations, those of all devices, to the running statistics."""
     return running_statistics.update(normalizer, obs, std_min_value=MIN_OBSERVATION_STD, pmap_axis_name=axis_name)

@@ -1,12 +1,27 @@
 """Adam whose learning rate is an argument of every step, and schedules over environment steps."""
 
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import optax
+from jax import Array
+from jaxtyping import Float
 
 from mjx_walk.utils import collectives
+from mjx_walk.utils.types import PyTree
+
+__all__ = [
+    "adapt_rate",
+    "anneal_discount",
+    "apply_gradients",
+    "make_adam",
+    "polyak_update",
+    "remaining_fraction",
+    "schedule_factor",
+]
+
+_ParamsT = TypeVar("_ParamsT")
 
 
 def make_adam(max_grad_norm: float | None = None) -> optax.GradientTransformation:
@@ -18,12 +33,12 @@ def make_adam(max_grad_norm: float | None = None) -> optax.GradientTransformatio
 
 def apply_gradients(
     optimizer: optax.GradientTransformation,
-    params: Any,
-    grads: Any,
+    params: _ParamsT,
+    grads: _ParamsT,
     state: optax.OptState,
-    learning_rate: Any,
+    learning_rate: PyTree,
     axis_name: str | None,
-) -> tuple[Any, optax.OptState]:
+) -> tuple[_ParamsT, optax.OptState]:
     """One gradient step.
 
     Args:
@@ -42,29 +57,29 @@ def apply_gradients(
     return optax.apply_updates(params, steps), state
 
 
-def polyak_update(target: Any, params: Any, tau: float) -> Any:
+def polyak_update(target: _ParamsT, params: _ParamsT, tau: float) -> _ParamsT:
     """`(1 − τ) target + τ params`."""
     return jax.tree.map(lambda t, p: (1.0 - tau) * t + tau * p, target, params)
 
 
-def remaining_fraction(steps: jax.Array, horizon: int) -> jax.Array:
+def remaining_fraction(steps: Float[Array, ""], horizon: int) -> Float[Array, ""]:
     """The fraction of a schedule that is left: 1 at the start, linearly to 0 at `horizon` steps, then 0."""
     return jnp.clip(1.0 - steps / horizon, 0.0, 1.0)
 
 
-def schedule_factor(schedule: str, remaining: jax.Array) -> jax.Array | float:
+def schedule_factor(schedule: str, remaining: Float[Array, ""]) -> Float[Array, ""] | float:
     """The factor that a schedule gives a setting: 1 if it is `constant`, else the fraction that is left."""
     return 1.0 if schedule == "constant" else remaining
 
 
-def anneal_discount(first: float, last: float | None, remaining: jax.Array) -> jax.Array | float:
+def anneal_discount(first: float, last: float | None, remaining: Float[Array, ""]) -> Float[Array, ""] | float:
     """A discount whose horizon 1 / (1 - γ) moves geometrically from the first to the last; constant without a last."""
     if last is None:
         return first
     return 1.0 - (1.0 - first) ** remaining * (1.0 - last) ** (1.0 - remaining)
 
 
-def adapt_rate(rate: jax.Array, kl: jax.Array, target: float) -> jax.Array:
+def adapt_rate(rate: Float[Array, ""], kl: Float[Array, ""], target: float) -> Float[Array, ""]:
     """The learning rate that keeps the policy's KL from the acting policy near a target.
 
     Source: rsl_rl: ÷ 1.5 above twice the target, × 1.5 below half of it. Deviations: once a batch, not at each

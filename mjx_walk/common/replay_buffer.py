@@ -5,11 +5,15 @@ import dataclasses
 import flax
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, PRNGKeyArray
 
 from mjx_walk.common.returns import n_step_return
 from mjx_walk.envs import Task
 from mjx_walk.machine.devices import num_bytes
 from mjx_walk.utils.types import Transition
+
+__all__ = ["Replay", "ReplayBuffer", "Steps"]
 
 _GOES_ON, _TERMINATED, _FIRST_CUT = 0, 1, 2
 """Values of `Replay.end`; `_FIRST_CUT + i` is a truncation whose last observation lies in slot i."""
@@ -23,29 +27,29 @@ class Replay(flax.struct.PyTreeNode):
     `max_episode_steps` apart, so a few slots per environment suffice, and a slot is free again when its turn comes.
     """
 
-    observation: jax.Array
+    observation: Array
     """`[T + slots, B, observation_size]`."""
-    action: jax.Array
+    action: Array
     """`[T, B, action_size]`, in the networks' `[-1, 1]`."""
-    reward: jax.Array
+    reward: Array
     """`[T, B] f32`."""
-    end: jax.Array
+    end: Array
     """`[T, B] i16`, i32 where there are so many slots: whether and how the step ended its episode."""
-    cuts: jax.Array
+    cuts: Array
     """`[B] i32`: truncations so far."""
-    rows: jax.Array
+    rows: Array
     """`[] i32`: rows ever written."""
 
 
 class Steps(flax.struct.PyTreeNode):
     """Consecutive steps of all environments, `[U, B, …]`."""
 
-    observation: jax.Array
-    action: jax.Array
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    next_observation: jax.Array
+    observation: Array
+    action: Array
+    reward: Array
+    terminated: Array
+    truncated: Array
+    next_observation: Array
     """The true one; read only where an episode was truncated."""
 
 
@@ -120,7 +124,7 @@ class ReplayBuffer:
         )
 
     def sample(
-        self, replay: Replay, key: jax.Array, batch_size: int, n_step: int, discount: jax.Array | float
+        self, replay: Replay, key: PRNGKeyArray, batch_size: int, n_step: int, discount: Float[Array, ""] | float
     ) -> Transition:
         """Draw transitions over up to `n_step` steps, uniformly and with replacement.
 

@@ -3,21 +3,37 @@
 import flax
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int32
 
 from mjx_walk.utils import collectives
 from mjx_walk.utils.types import PER_DEVICE
 
+__all__ = [
+    "ReturnScale",
+    "bootstrap_truncated",
+    "init_return_scale",
+    "n_step_return",
+    "returns_to_go",
+    "reward_multiplier",
+    "update_return_scale",
+]
+
 
 def bootstrap_truncated(
-    reward: jax.Array, truncated: jax.Array, next_value: jax.Array, discount: float, reward_scale: jax.Array | float
-) -> jax.Array:
+    reward: Float[Array, "*batch"],
+    truncated: Bool[Array, "*batch"],
+    next_value: Float[Array, "*batch"],
+    discount: float,
+    reward_scale: Float[Array, ""] | float,
+) -> Float[Array, "*batch"]:
     """Fold the value lost at a time limit into the reward of the step that met it.
 
     A truncated step can then be handled like a terminated one, because its reward includes the lost value.
 
     Args:
         reward: unscaled.
-        truncated: bool, true only where the episode did not also terminate.
+        truncated: true only where the episode did not also terminate.
         next_value: value of the true next observation, on the scale of the scaled rewards.
         discount: γ.
         reward_scale: what the learner will multiply rewards by.
@@ -28,16 +44,18 @@ def bootstrap_truncated(
     return reward + jnp.where(truncated, discount * next_value / reward_scale, 0.0)
 
 
-def n_step_return(reward: jax.Array, ended: jax.Array, discount: jax.Array | float) -> tuple[jax.Array, jax.Array]:
+def n_step_return(
+    reward: Float[Array, "n N"], ended: Bool[Array, "n N"], discount: Float[Array, ""] | float
+) -> tuple[Float[Array, " N"], Int32[Array, " N"]]:
     """Discounted rewards up to the end of the episode, or over all n steps.
 
     Args:
-        reward: `[n, N]`.
-        ended: `[n, N] bool`, whether the episode ended at a step, in whichever way.
+        reward: unscaled.
+        ended: whether the episode ended at a step, in whichever way.
         discount: γ.
 
     Returns:
-        `Σ γ^i r_i` over the steps that count, `[N] f32`, and their number, `[N] i32`, from 1 to n.
+        `Σ γ^i r_i` over the steps that count, and their number, from 1 to n.
     """
     steps = jnp.arange(reward.shape[0])[:, None]
     still_on = jnp.cumsum(ended, axis=0) - ended == 0
@@ -45,19 +63,19 @@ def n_step_return(reward: jax.Array, ended: jax.Array, discount: jax.Array | flo
 
 
 def returns_to_go(
-    reward: jax.Array, terminated: jax.Array, truncated: jax.Array, discount: float
-) -> tuple[jax.Array, jax.Array]:
+    reward: Float[Array, "T N"], terminated: Bool[Array, "T N"], truncated: Bool[Array, "T N"], discount: float
+) -> tuple[Float[Array, "T N"], Float[Array, "T N"]]:
     """Observed discounted rewards from each step to the end of its episode.
 
     Args:
-        reward: `[T, N]`.
-        terminated: `[T, N] bool`.
-        truncated: `[T, N] bool`; the episode was cut off after this step.
+        reward: unscaled.
+        terminated: no reward follows this step.
+        truncated: the episode was cut off after this step.
         discount: γ.
 
     Returns:
-        The sums, `[T, N] f32`; and the factor at which the future that was not seen would enter, `[T, N] f32`: 0 where
-        the episode terminated, else γ to the number of steps to the cut or to the last of the T.
+        The sums; and the factor at which the future that was not seen would enter: 0 where the episode terminated, else
+        γ to the number of steps to the cut or to the last of the T.
     """
 
     def back(carry, step):
@@ -79,12 +97,12 @@ class ReturnScale(flax.struct.PyTreeNode):
     Source: `VecNormalize` of Stable-Baselines3 (`r / std(G)`, with `G ← γ G + r` running through each environment).
     """
 
-    running_return: jax.Array = flax.struct.field(metadata=PER_DEVICE)
+    running_return: Array = flax.struct.field(metadata=PER_DEVICE)
     """`[B] f32`."""
-    count: jax.Array
-    mean: jax.Array
-    variance: jax.Array
-    largest: jax.Array
+    count: Array
+    mean: Array
+    variance: Array
+    largest: Array
     """The largest `|G|` so far."""
 
 
@@ -95,12 +113,12 @@ def init_return_scale(num_envs: int) -> ReturnScale:
 
 def update_return_scale(
     scale: ReturnScale,
-    reward: jax.Array,
-    done: jax.Array,
-    discount: jax.Array | float,
+    reward: Float[Array, "T B"],
+    done: Bool[Array, "T B"],
+    discount: Float[Array, ""] | float,
     axis_name: str | None = None,
 ) -> ReturnScale:
-    """Add a chronological `[T, B]` block of rewards, one on each device, to the running variance."""
+    """Add a chronological block of rewards, one on each device, to the running variance."""
 
     def advance(running, inputs):
         reward, done = inputs
@@ -120,7 +138,7 @@ def update_return_scale(
     return ReturnScale(running, count, mean, variance, largest)
 
 
-def reward_multiplier(scale: ReturnScale, bound: float | None = None) -> jax.Array:
+def reward_multiplier(scale: ReturnScale, bound: float | None = None) -> Float[Array, ""]:
     """`1 / std(G)`, or less if a bound is given and the largest normalized `|G|` would exceed it.
 
     Source of the bound: SimbaV2 (Lee et al. 2025).

@@ -1,37 +1,46 @@
 """Run a policy: collect training data, or play complete episodes."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int32, PRNGKeyArray
 
-from mjx_walk.envs import Task
+from mjx_walk.envs import TrainableTask
 from mjx_walk.envs.inline_evaluation import InlineEvaluation
 from mjx_walk.envs.vector_env import Outcome, VectorEnv, VectorState
-from mjx_walk.utils.types import Metrics, PolicyFn
+from mjx_walk.utils.types import Metrics, PolicyFn, PyTree
 
-Actor = Callable[[jax.Array, Any], tuple[jax.Array, Any]]
-"""`(obs [B, …], inputs of the step) → (action [B, action_size] in Gymnasium's units, extras)`."""
+__all__ = ["Actor", "Step", "evaluate", "unroll"]
+
+_InputsT = TypeVar("_InputsT")
+_ExtrasT = TypeVar("_ExtrasT")
+_KeptT = TypeVar("_KeptT")
+
+Actor = Callable[[Float[Array, "B observation_size"], _InputsT], tuple[Float[Array, "B action_size"], _ExtrasT]]
+"""`(obs, inputs of the step) → (action in Gymnasium's units, extras)`."""
 
 
 class Step(NamedTuple):
     """One step of all environments, `[B, …]`; stacked over time, `[T, B, …]`."""
 
-    obs: jax.Array
-    action: jax.Array
+    obs: Array
+    action: Array
     outcome: Outcome
-    extras: Any
+    extras: PyTree
+    """Of the actor."""
 
 
 def unroll(
     env: VectorEnv,
     state: VectorState,
     evaluation: InlineEvaluation,
-    actor: Actor,
-    inputs: Any,
-    keep: Callable[[Step], Any],
-) -> tuple[VectorState, InlineEvaluation, Any, Metrics]:
+    actor: Actor[_InputsT, _ExtrasT],
+    inputs: _InputsT,
+    keep: Callable[[Step], _KeptT],
+) -> tuple[VectorState, InlineEvaluation, _KeptT, Metrics]:
     """Step all environments T times.
 
     Args:
@@ -57,17 +66,19 @@ def unroll(
     return state, evaluation, kept, jax.tree.map(lambda x: x.sum(0), metrics)
 
 
-def evaluate(task: Task, num_episodes: int, policy: PolicyFn, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def evaluate(
+    task: TrainableTask, num_episodes: int, policy: PolicyFn, key: PRNGKeyArray
+) -> tuple[Float[Array, " {num_episodes}"], Int32[Array, " {num_episodes}"]]:
     """Play complete episodes in one batch, until the last of them has ended.
 
     Args:
         task: the unbatched environment.
-        num_episodes: B.
+        num_episodes: environments, which play one episode each.
         policy: usually deterministic.
         key: for the starts and, if the policy samples, the actions.
 
     Returns:
-        Undiscounted returns `[B] f32` and lengths `[B] i32`.
+        Undiscounted returns, and lengths in steps.
     """
     reset_key, run_key = jax.random.split(key)
     start = jax.vmap(task.reset)(jax.random.split(reset_key, num_episodes))

@@ -12,6 +12,18 @@ import numpy as np
 
 from mjx_walk.envs import State, Task, make_env
 
+__all__ = [
+    "AIRBORNE_HEIGHT",
+    "THROWN_SPEED",
+    "TOLERANCES",
+    "Error",
+    "Parity",
+    "check",
+    "compare",
+    "one_step",
+    "reference_states",
+]
+
 TOLERANCES = {"qpos": (1e-6, 2e-5), "qvel": (5e-5, 2e-3), "other": (1e-4, 1e-2)}
 """Limits of the median and the 99th percentile of each step's worst element.
 

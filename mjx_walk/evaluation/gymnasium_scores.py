@@ -20,7 +20,9 @@ from mjx_walk.machine.signals import undisturbed
 from mjx_walk.machine.subprocesses import start_module
 from mjx_walk.storage.scores import Scores
 from mjx_walk.utils.setting_fields import MAX_SEED, setting
-from mjx_walk.utils.types import PolicyFn
+from mjx_walk.utils.types import Act, PolicyFn
+
+__all__ = ["Episodes", "ScoreRequest", "compile_episodes", "score_in_gymnasium", "score_in_sim"]
 
 _MAX_PARALLEL_EPISODES = 1024
 """Episodes played at once; an environment takes about 1 MB."""
@@ -39,7 +41,7 @@ Episodes = Callable[[jax.Array, int], tuple[jax.Array, jax.Array]]
 """`key, N → returns [N] f32, lengths [N] i32`."""
 
 
-def score_in_gymnasium(task: Task, act: Callable[[Any], Any], num_episodes: int, seed: int = 0) -> Scores:
+def score_in_gymnasium(task: Task, act: Act, num_episodes: int, seed: int = 0) -> Scores:
     """Score complete episodes in `gymnasium.make`: MuJoCo on the CPU, in float64, with the model's own solver.
 
     One process per core plays the episodes. A task without an equivalent in Gymnasium is scored in its own engine.
@@ -65,7 +67,7 @@ def score_in_gymnasium(task: Task, act: Callable[[Any], Any], num_episodes: int,
 
 
 def _play_in_gymnasium(
-    task: Task, act: Callable[[np.ndarray], np.ndarray], seeds: list[int], progress: ScoringProgress, rounds_before: int
+    task: Task, act: Act, seeds: list[int], progress: ScoringProgress, rounds_before: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Play one episode per seed, all in parallel; their returns and lengths."""
     steps_before = rounds_before * task.max_episode_steps
@@ -94,7 +96,7 @@ def _play_in_gymnasium(
     return returns, lengths
 
 
-def _send(worker: Popen, message: Any) -> None:
+def _send(worker: Popen, message: object) -> None:
     assert worker.stdin
     send(worker.stdin, message)
 

@@ -9,11 +9,13 @@ import os
 import pickle
 import sys
 import warnings
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
 from mjx_walk.machine.streams import open_standard_streams
+
+__all__ = ["send", "serve"]
 
 _STDOUT, _STDERR = 1, 2
 
@@ -50,7 +52,7 @@ def serve() -> None:
         send(answers, (obs, rewards, is_over))
 
 
-def send(pipe: IO[bytes], message: Any) -> None:
+def send(pipe: IO[bytes], message: object) -> None:
     """Write one message to a pipe, and flush it."""
     pickle.dump(message, pipe, protocol=pickle.HIGHEST_PROTOCOL)
     pipe.flush()

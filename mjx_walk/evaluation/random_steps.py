@@ -7,6 +7,8 @@ import jax.numpy as jnp
 
 from mjx_walk.envs import Task
 
+__all__ = ["NUM_STEPS", "RandomSteps", "take_random_steps"]
+
 NUM_STEPS = 250
 """Steps from each start. Nothing is reset within them, so that bodies that fall lie on the floor and move there."""
 

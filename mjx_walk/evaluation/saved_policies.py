@@ -4,8 +4,6 @@ import dataclasses
 import functools
 import logging
 import warnings
-from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,18 +18,21 @@ from mjx_walk.settings.config import Config
 from mjx_walk.settings.input_files import check_model, warn_of_changed_inputs
 from mjx_walk.settings.saved_config import read_saved_config
 from mjx_walk.storage import checkpoint
+from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import BEST, FINAL, POLICIES
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.types import PolicyFn
+from mjx_walk.utils.types import Act, PolicyFn, PolicyParams
 
 __all__ = [
     "SavedPolicy",
     "best_policy",
+    "choose_policy",
     "default_policy",
     "deterministic_act",
     "deterministic_policy",
     "kept_policies",
+    "load_policy",
     "make_acting_algorithm",
     "make_task",
 ]
@@ -73,18 +74,18 @@ class SavedPolicy:
         self.task = make_task(dataclasses.replace(self.config, physics=engine))
         self.algorithm = make_acting_algorithm(self.task, self.config)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """Pickle and copy the parameters, without compiled functions."""
         kept = {name: value for name, value in vars(self).items() if name not in ("task", "algorithm", "act")}
         return kept | {"policy_params": jax.device_get(self.policy_params)}
 
     @standard_settings()
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         vars(self).update(state)
         self._build()
 
     @functools.cached_property
-    def act(self) -> Callable:
+    def act(self) -> Act:
         """The deterministic policy as a compiled JAX function of f32 observations."""
         return deterministic_act(self.algorithm, self.policy_params)
 
@@ -119,7 +120,7 @@ def make_acting_algorithm(task: Task, config: Config) -> Algorithm:
     return make_algorithm(task, config.num_envs, config.evaluation, algo)
 
 
-def deterministic_act(algorithm: Algorithm, policy_params: Any) -> Callable[[Any], Any]:
+def deterministic_act(algorithm: Algorithm, policy_params: PolicyParams) -> Act:
     """Compile the deterministic policy, `obs […, observation_size] → action […, action_size]`, in Gymnasium's units."""
 
     @jax.jit
@@ -131,7 +132,7 @@ def deterministic_act(algorithm: Algorithm, policy_params: Any) -> Callable[[Any
     return act
 
 
-def deterministic_policy(algorithm: Algorithm, policy_params: Any) -> PolicyFn:
+def deterministic_policy(algorithm: Algorithm, policy_params: PolicyParams) -> PolicyFn:
     """The deterministic policy, `(obs, key) → action`.
 
     It multiplies matrices in float32. A GPU's default precision would change actions by up to 4e-3.
@@ -175,7 +176,7 @@ def kept_policies(folder: RunFolder) -> list[str]:
     return [name for name in POLICIES if checkpoint.find(folder.policy(name))]
 
 
-def _load(folder: RunFolder, name: str, algorithm: Algorithm) -> tuple[Any, dict[str, Any]]:
+def _load(folder: RunFolder, name: str, algorithm: Algorithm) -> tuple[PolicyParams, Metadata]:
     """A policy that a run has kept; if it is damaged, the one in the newest checkpoint that is complete."""
     state = algorithm.state_shapes()
     try:
@@ -191,7 +192,7 @@ def _load(folder: RunFolder, name: str, algorithm: Algorithm) -> tuple[Any, dict
     return best or (algorithm.policy_params(state), {"env_steps": metadata["env_steps"]})
 
 
-def load_policy(folder: RunFolder, name: str, like: Any) -> tuple[Any, dict[str, Any]]:
+def load_policy(folder: RunFolder, name: str, like: PolicyParams) -> tuple[PolicyParams, Metadata]:
     """A policy that a run has kept, its `env_steps`, and `eval_return` if an evaluation during training chose it.
 
     Raises:
@@ -206,10 +207,13 @@ def load_policy(folder: RunFolder, name: str, like: Any) -> tuple[Any, dict[str,
         raise
     except ValueError as error:
         raise UserError(str(error)) from error
-    return params, {name: meta[name] for name in ("env_steps", "eval_return") if name in meta}
+    metadata: Metadata = {"env_steps": meta["env_steps"]}
+    if "eval_return" in meta:
+        metadata["eval_return"] = meta["eval_return"]
+    return params, metadata
 
 
-def best_policy(state: TrainState, steps_per_iteration: int) -> tuple[Any, dict[str, Any]] | None:
+def best_policy(state: TrainState, steps_per_iteration: int) -> tuple[PolicyParams, Metadata] | None:
     """Policy with the highest inline evaluation, and its metadata. None until the first evaluation ends.
 
     Args:

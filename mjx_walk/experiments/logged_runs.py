@@ -4,7 +4,6 @@ import dataclasses
 import warnings
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.stats
@@ -14,8 +13,10 @@ from mjx_walk.logs.metrics import Row, read_rows
 from mjx_walk.settings.config import Config, flatten
 from mjx_walk.settings.saved_config import read_saved_config
 from mjx_walk.storage.run_folder import RunFolder, open_existing
-from mjx_walk.storage.scores import BEST, BETTER, ScoreFile, read_scores
+from mjx_walk.storage.scores import BEST, BETTER, ScoreBlock, ScoreFile, read_scores
 from mjx_walk.utils.errors import UserError
+
+__all__ = ["MIN_SEEDS_FOR_INTERVALS", "MIN_SEEDS_FOR_IQM", "LoggedRun", "group", "interval", "mean_curve", "read_runs"]
 
 MIN_SEEDS_FOR_INTERVALS = 3
 MIN_SEEDS_FOR_IQM = 10
@@ -47,7 +48,7 @@ class LoggedRun:
         """Number of seeds that shared the run's process, and so its seconds."""
         return self.rows[-1].get("speed/seeds_together", 1)
 
-    def score(self, policy: str) -> dict[str, Any]:
+    def score(self, policy: str) -> ScoreBlock:
         """Scores of the final or the best policy, empty if it was not scored.
 
         A file with one block holds the better of both, which counts as the best.
@@ -103,7 +104,7 @@ def group(runs: list[LoggedRun]) -> dict[str, list[LoggedRun]]:
     return dict(groups)
 
 
-def _settings(config: Config) -> dict[str, Any]:
+def _settings(config: Config) -> dict[str, object]:
     return {key: value for key, value in flatten(config).items() if key not in ("run_dir", "resume", "seed")}
 
 

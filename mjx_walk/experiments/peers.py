@@ -18,6 +18,9 @@ from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.experiments.timing import Measurement
 from mjx_walk.training.programs import make_init, make_step
+from mjx_walk.utils.types import PyTree
+
+__all__ = ["BraxTask", "brax_ppo_speed", "brax_sac_speed", "measure", "restore_device_put_replicated", "sac_speed"]
 
 _UNROLL_LENGTH = 10
 _EPISODE_LENGTH = 1000
@@ -86,7 +89,7 @@ def restore_device_put_replicated() -> None:
         jax.device_put_replicated = _device_put_replicated  # type: ignore[assignment]
 
 
-def _device_put_replicated(tree: Any, devices: list[jax.Device]) -> Any:
+def _device_put_replicated(tree: PyTree, devices: list[jax.Device]) -> PyTree:
     assert len(devices) == 1, "the replacement supports one device"
     return jax.tree.map(lambda x: jax.device_put(jnp.asarray(x)[None], devices[0]), tree)
 

@@ -32,6 +32,8 @@ from mjx_walk.training.folder_checks import locked_folder
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.text import format_score
 
+__all__ = ["PlannedRun", "jobs", "most_together", "plan", "run_jobs", "start_job"]
+
 _SECONDS_BETWEEN_REPORTS = 30.0
 _MEMORY_FRACTION = 0.75
 """Share of a GPU's memory that JAX allocates at its start by default."""

@@ -6,7 +6,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +22,10 @@ from mjx_walk.experiments.timing import Measurement
 from mjx_walk.machine.devices import default_device
 from mjx_walk.settings.config import Config
 from mjx_walk.training.programs import make_init, make_step
-from mjx_walk.utils.types import Metrics, as_means
+from mjx_walk.utils.types import Metrics, PyTree, as_means
 from mjx_walk.viewing.episode import make_gymnasium
+
+__all__ = ["matmul_speed", "measure", "time_parts"]
 
 _STEPS_PER_CALL = 25
 """About as long as a random policy keeps a humanoid upright. Every call starts from resets, like real episodes."""
@@ -57,7 +59,10 @@ def measure(config: Config, task: Task, seconds: float) -> Iterator[Measurement]
         yield from _insert_times(task)
 
 
-def _seconds_per_call(advance: Callable[[Any], Any], carry: Any, seconds: float) -> tuple[Any, float]:
+_Carry = TypeVar("_Carry")
+
+
+def _seconds_per_call(advance: Callable[[_Carry], _Carry], carry: _Carry, seconds: float) -> tuple[_Carry, float]:
     """The carry after repeated calls of `carry → carry`, and seconds per call without the first one, which compiles."""
     carry = jax.block_until_ready(advance(carry))
     start, calls = time.monotonic(), 0
@@ -67,14 +72,16 @@ def _seconds_per_call(advance: Callable[[Any], Any], carry: Any, seconds: float)
     return carry, (time.monotonic() - start) / calls
 
 
-def _random_action_speed(task: Task, start: Any, step: Callable[[Any, jax.Array], Any], seconds: float) -> float:
+def _random_action_speed(
+    task: Task, start: PyTree, step: Callable[[PyTree, jax.Array], PyTree], seconds: float
+) -> float:
     """Environment steps per second of `step`, under random actions from a batch of starts."""
     advance = jax.jit(functools.partial(_advance, task, start, jax.vmap(step)))
     num_steps = len(jax.tree.leaves(start)[0]) * _STEPS_PER_CALL
     return num_steps / _seconds_per_call(advance, jax.random.PRNGKey(1), seconds)[1]
 
 
-def _advance(task: Task, start: Any, step: Callable[[Any, jax.Array], Any], key: jax.Array) -> jax.Array:
+def _advance(task: Task, start: PyTree, step: Callable[[PyTree, jax.Array], PyTree], key: jax.Array) -> jax.Array:
     """Take random actions for `_STEPS_PER_CALL` steps from the start, and return the next key."""
     shape = (len(jax.tree.leaves(start)[0]), task.action_size)
 
@@ -136,7 +143,7 @@ def time_parts(algorithm: Algorithm, iterations_per_call: int, fused: bool, seco
     return collecting / iterations_per_call, learning
 
 
-def _read_batch(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
+def _read_batch(state: TrainState, batch: PyTree) -> tuple[TrainState, Metrics]:
     """Stand in for `learn`: read the batch, so that the compiler keeps it."""
     total = jnp.stack([jnp.sum(x, dtype=jnp.float32) for x in jax.tree.leaves(batch)]).sum()
     return state, as_means({"batch": total})

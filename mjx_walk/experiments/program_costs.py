@@ -10,6 +10,9 @@ from jax.extend import core
 from mjx_walk.algos import Algorithm
 from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.utils.collectives import DEVICES
+from mjx_walk.utils.types import PyTree
+
+__all__ = ["learning_flops", "matmul_flops", "reduced_bytes"]
 
 _REDUCTIONS = ("psum", "pmax", "all_gather")
 
@@ -19,7 +22,7 @@ def learning_flops(algorithm: Algorithm) -> float:
     return matmul_flops(algorithm.learn, *_learning_inputs(algorithm))
 
 
-def matmul_flops(function: Callable, *arguments: Any) -> float:
+def matmul_flops(function: Callable, *arguments: PyTree) -> float:
     """Floating-point operations of the matrix products in one call.
 
     Of a conditional's branches only the most expensive one counts. The body of a loop of unknown length counts once.
@@ -42,7 +45,7 @@ def reduced_bytes(algorithm: Algorithm, num_devices: int) -> float:
     return _total(trace(*_learning_inputs(algorithm)).jaxpr, _bytes_given)
 
 
-def _learning_inputs(algorithm: Algorithm) -> tuple[Any, Any]:
+def _learning_inputs(algorithm: Algorithm) -> tuple[PyTree, PyTree]:
     """Shapes of the arguments of `learn`."""
     shapes = algorithm.state_shapes()
     with nothing_runs():

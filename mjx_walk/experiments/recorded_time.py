@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 from jax.profiler import ProfileData, ProfileEvent
 
+__all__ = ["DeviceTime", "read_device_time"]
+
 _REDUCTION = re.compile(r"nccl|(psum|pmax|all[-_](reduce|gather))[-.\w]*$", re.IGNORECASE)
 """NCCL's kernels on a GPU, XLA's operations on a CPU."""
 _PHYSICS = re.compile(r"_cuda_kernel_forward")

@@ -1,7 +1,6 @@
 """The report on runs of one environment: learning curves, Markdown tables and a CSV file."""
 
 from pathlib import Path
-from typing import Any
 
 import matplotlib.figure
 import numpy as np
@@ -14,6 +13,8 @@ from mjx_walk.storage.files import replacing, write_text
 from mjx_walk.storage.scores import BEST, FINAL
 from mjx_walk.utils.text import format_score, in_markdown
 from mjx_walk.viewing.run_plots import evaluations, learning_axes, series
+
+__all__ = ["DRAWN", "LEGEND", "csv_row", "draw_curves", "run_cells", "table", "write_comparison"]
 
 DRAWN = (
     "Lines: with exploration noise, each seed thin, their mean bold. Dots: evaluations without noise. "
@@ -138,7 +139,7 @@ def run_cells(variant: str, run: LoggedRun) -> dict[str, str]:
     }
 
 
-def csv_row(variant: str, run: LoggedRun) -> dict[str, Any]:
+def csv_row(variant: str, run: LoggedRun) -> dict[str, object]:
     """Values about one run, by column."""
     last = run.rows[-1]
     scores = {f"{policy}_{name}": run.score(policy).get(name) for policy in (FINAL, BEST) for name in ("mean", "std")}

@@ -20,6 +20,8 @@ from mjx_walk.training.call_profile import CALLS_BEFORE
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["Speed", "measure", "measure_speed", "share_of_total"]
+
 _MIN_CALLS = 3
 _ENDLESS = 10**12
 

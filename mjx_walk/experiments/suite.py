@@ -21,6 +21,8 @@ from mjx_walk.utils.text import format_score
 from mjx_walk.viewing.figures import standard_style
 from mjx_walk.viewing.run_plots import THOUSANDS
 
+__all__ = ["REFERENCES", "SUITES", "Tasks", "normalize", "plan_suite", "write_report"]
+
 SUITES = {"mujoco": tuple(BUILT_IN_TASKS)}
 """Environments of each suite."""
 

@@ -14,6 +14,8 @@ from mjx_walk.machine.signals import as_by_ctrl_c
 from mjx_walk.machine.subprocesses import start_module, with_parent
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["Measurement", "measure_first_calls", "training"]
+
 _PATIENCE = 60.0
 """Seconds: a training hangs if it logs no row for at least this long, and is killed if it takes longer to end."""
 

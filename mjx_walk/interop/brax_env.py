@@ -19,6 +19,8 @@ from mjx_walk.envs.state import check_action_shape
 from mjx_walk.machine.compat import standard_dtypes
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["BraxEnv"]
+
 _MODEL_ARRAYS = {field.name for field in dataclasses.fields(mjx.Model)}
 _INSTEAD = {
     "gravity": "opt.gravity",
@@ -56,7 +58,7 @@ class BraxEnv(base.Env):
     It has no time limit of its own; Brax's `EpisodeWrapper` adds one, as for Brax's environments.
     """
 
-    def __init__(self, env: str, physics: str = "auto", **keywords: Any):
+    def __init__(self, env: str, physics: str = "auto", **keywords: object):
         """
         Args:
             env: name of the task.
@@ -183,6 +185,6 @@ def _check_switches(changes: dict[str, jax.Array], model: mujoco.MjModel) -> Non
             raise UserError(f"the model has no {' or '.join(group)}, so MJX does not read '{name}'; give it a value")
 
 
-def _dotted(path: tuple[Any, ...]) -> str:
+def _dotted(path: jax.tree_util.KeyPath) -> str:
     """Path of a leaf as `tree_replace` takes it, such as `opt.gravity`."""
     return jax.tree_util.keystr(path, simple=True, separator=".")

@@ -22,6 +22,8 @@ from mjx_walk.interop.mujoco_attributes import (
     split_keywords,
 )
 
+__all__ = ["MjxWalkEnv"]
+
 _NOT_PICKLED = ("_gymnasium_env", "_snapshot", "_programs")
 
 
@@ -33,7 +35,7 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
 
     metadata = {"render_modes": list(RENDER_MODES)}
 
-    def __init__(self, env: str, physics: str = "auto", **keywords: Any):
+    def __init__(self, env: str, physics: str = "auto", **keywords: object):
         """
         Args:
             env: name of the task.
@@ -59,7 +61,7 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
         self._gymnasium_env = make_gymnasium_env(self._options, self._rendering)
         self._snapshot = ModelSnapshot(self._gymnasium_env.model)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: int | None = None, options: dict[str, object] | None = None):
         """Start an episode. A seed gives the start that it gives in Gymnasium, and determines all later episodes.
 
         Raises:
@@ -109,7 +111,7 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
         warmstart = None if self._state is None else self._state.physics.qacc_warmstart
         self._state, _ = self._programs.reset_to(qpos, qvel, warmstart)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         state = {name: jax.device_get(value) for name, value in vars(self).items() if name not in _NOT_PICKLED}
         return state | {"_init": (self.init_qpos, self.init_qvel)}
 

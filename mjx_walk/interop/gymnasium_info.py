@@ -1,14 +1,19 @@
 """Gymnasium's `info` dictionaries from arrays: of one environment, and with a mask for each entry of many."""
 
-from typing import Any
+from collections.abc import Mapping
 
+import jax
 import numpy as np
+
+__all__ = ["FLAGS", "add_flags", "add_info", "single_info"]
 
 FLAGS = ("nonfinite", "overflow")
 """Metrics that `info` holds, as 1.0, only where they are set."""
 
 
-def single_info(info: dict[str, Any], metrics: dict[str, Any] | None = None) -> dict[str, Any]:
+def single_info(
+    info: Mapping[str, jax.Array], metrics: Mapping[str, jax.Array] | None = None
+) -> dict[str, np.ndarray | np.float64 | float]:
     """The `info` of one environment.
 
     Args:
@@ -22,14 +27,14 @@ def single_info(info: dict[str, Any], metrics: dict[str, Any] | None = None) -> 
     return {name: _converted(value) for name, value in info.items()} | flags
 
 
-def _converted(value: Any) -> Any:
-    value = np.asarray(value)
-    if value.ndim:
-        return np.array(value, np.float64)
-    return int(value) if np.issubdtype(value.dtype, np.integer) else np.float64(value)
+def _converted(value: jax.Array) -> np.ndarray | np.float64 | int:
+    array = np.asarray(value)
+    if array.ndim:
+        return np.array(array, np.float64)
+    return int(array) if np.issubdtype(array.dtype, np.integer) else np.float64(array)
 
 
-def add_info(target: dict[str, Any], info: dict[str, Any], mask: np.ndarray) -> None:
+def add_info(target: dict[str, np.ndarray], info: Mapping[str, jax.Array | np.ndarray], mask: np.ndarray) -> None:
     """Add entries of some environments, as Gymnasium's `VectorEnv._add_info` adds those of one.
 
     Args:
@@ -46,7 +51,7 @@ def add_info(target: dict[str, Any], info: dict[str, Any], mask: np.ndarray) -> 
         target.setdefault(f"_{name}", np.zeros(mask.shape, np.bool_))[mask] = True
 
 
-def add_flags(target: dict[str, Any], metrics: dict[str, Any], mask: np.ndarray) -> None:
+def add_flags(target: dict[str, np.ndarray], metrics: Mapping[str, jax.Array], mask: np.ndarray) -> None:
     """Add the metrics of `FLAGS` for the environments of a mask, `[B] bool`, in which they are set."""
     for name in FLAGS:
         add_info(target, {name: metrics[name]}, mask & (np.asarray(metrics[name]) > 0))

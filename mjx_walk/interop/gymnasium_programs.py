@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import os
-from typing import Any
+from typing import TypeVar
 
 import gymnasium
 import jax
@@ -15,6 +15,8 @@ from mjx_walk.envs import TASKS, State, Task, TaskOptions
 from mjx_walk.envs.info import Info
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.machine.compat import prepare_jax
+
+__all__ = ["Programs", "is_forked", "make_programs", "refuse_fork"]
 
 _process_of_jax: list[int] = []
 """Id of the process in which this module first used JAX."""
@@ -132,6 +134,9 @@ def _split_each(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
     return pairs[:, 0], pairs[:, 1]
 
 
-def _select(mask: jax.Array, new: Any, old: Any) -> Any:
+_Tree = TypeVar("_Tree")
+
+
+def _select(mask: jax.Array, new: _Tree, old: _Tree) -> _Tree:
     """Rows of `new` where the mask is set, else of `old`, for all leaves `[B, …]`."""
     return jax.tree.map(lambda x, y: jnp.where(mask.reshape(mask.shape + (1,) * (x.ndim - 1)), x, y), new, old)

@@ -5,12 +5,15 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import jax
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from mjx_walk.envs import State
 from mjx_walk.interop.mujoco_attributes import MujocoAttributes
 
 if TYPE_CHECKING:
     from mjx_walk.interop.gymnasium_vector_env import MjxWalkVectorEnv
+
+__all__ = ["SubEnv"]
 
 
 class SubEnv(MujocoAttributes):
@@ -28,12 +31,12 @@ class SubEnv(MujocoAttributes):
         return self._vector_env.render_mode
 
     @property
-    def metadata(self) -> dict[str, Any]:
+    def metadata(self) -> dict[str, object]:
         """Gymnasium's for one environment."""
         return {name: value for name, value in self._vector_env.metadata.items() if name != "autoreset_mode"}
 
     @property
-    def spec(self) -> Any:
+    def spec(self) -> EnvSpec | None:
         return self._vector_env.spec
 
     @property
@@ -61,7 +64,7 @@ class SubEnv(MujocoAttributes):
         """Whether there is an attribute."""
         return hasattr(self, name)
 
-    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+    def set_wrapper_attr(self, name: str, value: object, *, force: bool = True) -> bool:
         """Set an attribute; without `force`, only one that exists. Returns whether it was set."""
         if force or hasattr(self, name):
             setattr(self, name, value)

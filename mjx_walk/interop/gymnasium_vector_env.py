@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from mjx_walk.envs import NO_TIME_LIMIT, State, make_options
+from mjx_walk.envs.info import Info
 from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.state import check_action_shape
 from mjx_walk.interop.gymnasium_info import add_flags, add_info
@@ -19,6 +20,8 @@ from mjx_walk.interop.gymnasium_sub_env import SubEnv
 from mjx_walk.interop.mujoco_attributes import RENDER_MODES, make_gymnasium_env, split_keywords
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.value_types import type_problem
+
+__all__ = ["MjxWalkVectorEnv"]
 
 _NOT_PICKLED = ("_gymnasium_env", "_snapshot", "_init", "_programs", "envs")
 
@@ -38,7 +41,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         env: str,
         physics: str = "auto",
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        **keywords: Any,
+        **keywords: object,
     ):
         """
         Args:
@@ -93,7 +96,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
             self._seed([None] * self.num_envs, np.ones(self.num_envs, np.bool_))
         return self._seeds
 
-    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, object] | None = None):
         """Start episodes in all environments, or in those of `options["reset_mask"]`, `[B] bool`.
 
         Args:
@@ -155,7 +158,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
             self._add_infos(info, infos, metrics, ~is_reset)
         return np.array(obs, np.float64), reward, terminated, truncated, info
 
-    def _add_infos(self, info: dict[str, Any], infos: list, metrics: dict[str, Any], stepped: np.ndarray) -> None:
+    def _add_infos(self, info: dict[str, np.ndarray], infos: list[Info], metrics: Info, stepped: np.ndarray) -> None:
         """Add the `info` of the step where an environment stepped, and that of the reset elsewhere."""
         step_info, reset_info = infos
         add_info(info, step_info, stepped)
@@ -163,7 +166,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         add_info(info, reset_info, ~stepped)
 
     def _add_final(
-        self, info: dict[str, Any], last_obs: np.ndarray, step_info: dict, metrics: dict, is_over: np.ndarray
+        self, info: dict[str, Any], last_obs: np.ndarray, step_info: Info, metrics: Info, is_over: np.ndarray
     ) -> None:
         """Add `final_obs`, an object array, and `final_info` of the episodes that end in this step."""
         final_obs = np.full(self.num_envs, None, dtype=object)
@@ -179,7 +182,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         """A frame of each environment."""
         return tuple(env.render() for env in self.envs)
 
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+    def call(self, name: str, *args: object, **kwargs: object) -> tuple[Any, ...]:
         """Results of a method of each environment, or values of an attribute; see `SubEnv`."""
         found = [getattr(env, name) for env in self.envs]
         return tuple(value(*args, **kwargs) if callable(value) else value for value in found)
@@ -188,7 +191,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         """Values of an attribute of each environment."""
         return self.call(name)
 
-    def set_attr(self, name: str, values: Any) -> None:
+    def set_attr(self, name: str, values: object) -> None:
         """Set an attribute of each environment, from a list or tuple of B values or from one value.
 
         Raises:
@@ -200,7 +203,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         for env, value in zip(self.envs, listed, strict=True):
             setattr(env, name, value)
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: object) -> None:
         """Close the OpenGL contexts."""
         self.envs[0]._close_gymnasium_env()
 
@@ -237,15 +240,15 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
                 keys[i] = rng.integers(2**32, size=2, dtype=np.uint32)
         self._keys, self._seeds = keys, tuple(known)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return {name: jax.device_get(value) for name, value in vars(self).items() if name not in _NOT_PICKLED}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         vars(self).update(state)
         self._build()
 
 
-def _with_gymnasiums_limit(options: dict[str, Any]) -> dict[str, Any]:
+def _with_gymnasiums_limit(options: dict[str, object]) -> dict[str, object]:
     """Options with a `max_episode_steps` as `gymnasium.make` takes it: None is the task's own limit, -1 is none."""
     others = {name: value for name, value in options.items() if name != "max_episode_steps"}
     limit = options.get("max_episode_steps")
@@ -255,7 +258,7 @@ def _with_gymnasiums_limit(options: dict[str, Any]) -> dict[str, Any]:
     return others | {"max_episode_steps": NO_TIME_LIMIT if is_unlimited else limit}
 
 
-def _checked_mask(mask: Any, num_envs: int) -> np.ndarray:
+def _checked_mask(mask: object, num_envs: int) -> np.ndarray:
     """Check a `reset_mask` as `SyncVectorEnv` does.
 
     Raises:

@@ -18,6 +18,8 @@ from mjx_walk.machine.opengl import has_screen
 from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["RENDER_KEYWORDS", "RENDER_MODES", "MujocoAttributes", "make_gymnasium_env", "split_keywords"]
+
 RENDER_KEYWORDS = (
     "render_mode",
     "width",
@@ -46,13 +48,13 @@ _SETTABLE = (
 RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple")
 
 
-def split_keywords(keywords: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def split_keywords(keywords: dict[str, object]) -> tuple[dict[str, object], dict[str, object]]:
     """Keywords of the task, and those of `RENDER_KEYWORDS`."""
     rendering = {name: value for name, value in keywords.items() if name in RENDER_KEYWORDS}
     return {name: value for name, value in keywords.items() if name not in rendering}, rendering
 
 
-def make_gymnasium_env(options: TaskOptions, rendering: dict[str, Any]) -> MujocoEnv:
+def make_gymnasium_env(options: TaskOptions, rendering: dict[str, object]) -> MujocoEnv:
     """Gymnasium's own environment, without wrappers.
 
     Args:
@@ -80,7 +82,7 @@ class MujocoAttributes:
     _gymnasium_env: MujocoEnv
     render_mode: str | None
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: object) -> None:
         """Set an attribute of the environment.
 
         Raises:

@@ -4,7 +4,7 @@ We do not use jax2onnx: its releases conflict with the Orbax version used here, 
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -15,6 +15,8 @@ from jax.extend import core
 from onnx import TensorProto, helper, numpy_helper
 
 from mjx_walk.utils.errors import UserError
+
+__all__ = ["DTYPES", "Value", "translate"]
 
 _OPSET = 17
 _UNARY = ("abs", "erf", "exp", "log", "neg", "not", "sign", "sqrt", "tanh")
@@ -75,10 +77,14 @@ def translate(
     return model
 
 
+Value = str | jax.Array | np.ndarray | np.generic
+"""The name of a node's output, or an array."""
+
+
 class _Graph:
     """The ONNX graph under construction.
 
-    A value that depends on the observation is the name of a node's output; any other value is an array. Values that
+    A `Value` that depends on the observation is the name of a node's output; any other is an array. Values that
     depend on the observation gain a leading batch axis: a vector is `[N, size]`, a scalar `[N, 1]`. ONNX then
     broadcasts them where JAX changes shapes.
     """
@@ -88,13 +94,13 @@ class _Graph:
         self.initializers: list[onnx.TensorProto] = []
         self._count = itertools.count()
 
-    def add(self, kind: str, inputs: list[Any], num_outputs: int = 1, **attributes: Any) -> list[str]:
+    def add(self, kind: str, inputs: Sequence[Value], num_outputs: int = 1, **attributes: Any) -> list[str]:
         """Append a node and return the names of its outputs."""
         names = [f"v{next(self._count)}" for _ in range(num_outputs)]
         self.nodes.append(helper.make_node(kind, [self.name(x) for x in inputs], names, **attributes))
         return names
 
-    def name(self, value: Any) -> str:
+    def name(self, value: Value) -> str:
         """Name of a value; an array is stored in the model first."""
         if isinstance(value, str):
             return value
@@ -111,9 +117,10 @@ class _Graph:
         self.initializers = [array for array in self.initializers if array.name in wanted]
         return kept[::-1]
 
-    def follow(self, jaxpr: core.Jaxpr, consts: Sequence[Any], arguments: list[Any]) -> list[Any]:
+    def follow(self, jaxpr: core.Jaxpr, consts: Sequence[Value], arguments: Sequence[Value]) -> list[Value]:
         """Append the nodes of a jaxpr and return its outputs."""
-        values: dict[Any, Any] = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *arguments), strict=True))
+        outputs: Sequence[Value]
+        values: dict[core.Var, Value] = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *arguments), strict=True))
         for equation in jaxpr.eqns:
             inputs = _lookup(values, equation.invars)
             if equation.primitive.name in _INLINED:
@@ -128,7 +135,7 @@ class _Graph:
             values |= zip(equation.outvars, outputs, strict=True)
         return _lookup(values, jaxpr.outvars)
 
-    def _nodes(self, equation: core.JaxprEqn, inputs: list[Any]) -> list[Any]:
+    def _nodes(self, equation: core.JaxprEqn, inputs: Sequence[Value]) -> Sequence[Value]:
         """Append the nodes of one primitive that depends on the observation, and return its outputs."""
         kind, params = equation.primitive.name, equation.params
         first = inputs[0]
@@ -161,6 +168,6 @@ class _Graph:
         raise UserError(f"the policy cannot be exported: there is no translation for '{kind}'")
 
 
-def _lookup(values: dict[Any, Any], variables: Sequence[Any]) -> list[Any]:
+def _lookup(values: Mapping[core.Var, Value], variables: Sequence[core.Var | core.Literal]) -> list[Value]:
     """Values of a jaxpr's variables; a literal holds its own."""
     return [variable.val if isinstance(variable, core.Literal) else values[variable] for variable in variables]

@@ -2,6 +2,8 @@
 
 import gymnasium
 
+__all__ = ["register"]
+
 _TASKS = {
     "Humanoid": ("humanoid", 1000),
     "HumanoidStandup": ("humanoid_standup", 1000),

@@ -11,11 +11,12 @@ import warnings
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from mjx_walk.logs.metrics import Row, read_rows
 from mjx_walk.logs.tensorboard import EventFile
 from mjx_walk.settings.config import Config, flatten
+from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.storage.files import Appender, read_bytes, replacing, write_text
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
@@ -23,13 +24,14 @@ from mjx_walk.utils.errors import UserError
 __all__ = ["MetricsWriter", "WandbLog", "require_wandb"]
 
 _MAX_ID_BYTES = 1000
-_LOG_ROWS, _LOG_CHECKSUM = "log_rows", "log_crc32"
+_LOG_ROWS: Final = "log_rows"
+_LOG_CHECKSUM: Final = "log_crc32"
 
 
 class MetricsWriter:
     """Appends rows to `metrics.jsonl` and to TensorBoard's event file."""
 
-    def __init__(self, run_dir: Path, resume_steps: int | None = None, position: Mapping[str, Any] | None = None):
+    def __init__(self, run_dir: Path, resume_steps: int | None = None, position: Metadata | None = None):
         """
         Args:
             run_dir: the run folder.
@@ -46,7 +48,7 @@ class MetricsWriter:
         self._events = EventFile(run_dir, resume_steps)
 
     @property
-    def position(self) -> dict[str, int]:
+    def position(self) -> Metadata:
         """Number and checksum of the rows so far, as metadata of a checkpoint."""
         return {_LOG_ROWS: self._num_rows, _LOG_CHECKSUM: self._checksum}
 
@@ -77,7 +79,7 @@ class MetricsWriter:
         self._num_rows += 1
         self._checksum = zlib.crc32(line, self._checksum)
 
-    def _drop_later_rows(self, resume_steps: int, position: Mapping[str, Any]) -> None:
+    def _drop_later_rows(self, resume_steps: int, position: Metadata) -> None:
         lines = [_as_line(row) for row in read_rows(self._path) if row["env_steps"] <= resume_steps]
         for line in lines:
             self._count(line)

@@ -3,7 +3,7 @@
 import csv
 import json
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from mjx_walk.storage.files import open_to_read, replacing
 from mjx_walk.utils.errors import UserError, failed_read
 from mjx_walk.utils.types import Metrics, Reduction
 
-__all__ = ["Row", "name_metrics", "physics_warnings", "read_rows", "write_csv"]
+__all__ = ["Row", "mean_row", "name_metrics", "physics_warnings", "read_rows", "write_csv"]
 
 Row = dict[str, float]
 """One line of `metrics.jsonl`. `name_metrics` lists the names."""
@@ -151,7 +151,7 @@ def _is_name(name: str) -> bool:
     return name[:1].isalpha() and name.isprintable() and len(name) <= _MAX_NAME
 
 
-def write_csv(rows: list[Row], path: Path) -> Path:
+def write_csv(rows: Sequence[Mapping[str, object]], path: Path) -> Path:
     """Write rows as CSV with a column for every name in any row. Missing values are empty.
 
     The last names are left out if there were too many cells.
@@ -165,7 +165,7 @@ def write_csv(rows: list[Row], path: Path) -> Path:
     return path
 
 
-def _as_cell(value: Any) -> Any:
+def _as_cell(value: object) -> object:
     """A value that a spreadsheet does not take for a formula."""
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
 

@@ -6,7 +6,6 @@ import shutil
 import sys
 import time
 from collections.abc import MutableMapping
-from typing import Any
 
 from tqdm import tqdm
 
@@ -32,7 +31,7 @@ class _Bar(tqdm):
     """Whether the time left is known."""
 
     @property
-    def format_dict(self) -> MutableMapping[str, Any]:
+    def format_dict(self) -> MutableMapping[str, object]:
         values = super().format_dict
         done, seconds = values["n"] - values["initial"], values["elapsed"]
         values["speed"] = ""

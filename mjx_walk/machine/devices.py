@@ -2,12 +2,13 @@
 
 import os
 import subprocess
-from typing import Any
 
 import jax
 
 from mjx_walk.machine.subprocesses import python
 from mjx_walk.utils.errors import UserError
+
+__all__ = ["count_devices", "default_backend", "default_device", "device_memory", "num_bytes", "only_device"]
 
 
 def default_backend() -> str:
@@ -62,7 +63,7 @@ def default_device() -> jax.Device:
     return chosen or jax.local_devices()[0]
 
 
-def num_bytes(tree: Any) -> int:
+def num_bytes(tree: object) -> int:
     """Bytes of a pytree of arrays or of their shapes and dtypes."""
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
 

@@ -12,7 +12,16 @@ from pathlib import Path
 
 import jax
 
-__all__ = ["Machine", "installed_version", "warn_of_unused_gpu", "warp_misfit", "why_unused"]
+__all__ = [
+    "CUDA_12_DRIVER",
+    "CUDA_13_DRIVER",
+    "ROOT",
+    "Machine",
+    "installed_version",
+    "warn_of_unused_gpu",
+    "warp_misfit",
+    "why_unused",
+]
 
 CUDA_13_DRIVER = 580
 """Oldest release of the driver for CUDA 13, on Linux."""

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 
 import mujoco
 
+__all__ = ["hide_deprecations", "write_no_log"]
+
 
 def write_no_log() -> None:
     """Stop MuJoCo from appending its warnings to `MUJOCO_LOG.TXT` in the working directory.

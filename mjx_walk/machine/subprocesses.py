@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+__all__ = ["end_with_parent", "python", "start_module", "with_parent"]
+
 _ROOT = Path(__file__).parents[2]
 _ENDED_BY_PARENT = "MJX_WALK_ENDED_BY"
 """Environment variable of a child process that must not outlive its parent: the parent's process id."""

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
@@ -70,7 +70,7 @@ def compose_config(overrides: list[str]) -> Config:
         raise UserError(with_paths(explain(error, overrides))) from error
 
 
-def to_config(node: Any) -> Config:
+def to_config(node: object) -> Config:
     """Convert a composed OmegaConf node to checked dataclasses.
 
     Raises:
@@ -102,17 +102,18 @@ def with_absolute_paths(config: Config, folder: Path) -> Config:
     return config
 
 
-def flatten(config: Config) -> dict[str, Any]:
+def flatten(config: Config) -> dict[str, object]:
     """All settings by their full keys, with values as in `config.yaml`."""
 
-    def walk(value: Any, prefix: str):
+    def walk(value: dict[str, object], prefix: str):
         for key, item in value.items():
             if isinstance(item, dict):
                 yield from walk(item, f"{prefix}{key}.")
             else:
                 yield prefix + key, item
 
-    return dict(walk(OmegaConf.to_container(OmegaConf.structured(config)), ""))
+    settings = cast(dict[str, object], OmegaConf.to_container(OmegaConf.structured(config)))
+    return dict(walk(settings, ""))
 
 
 def training_command(config: Config) -> str:

@@ -178,7 +178,7 @@ def _near_recipes(value: str, names: Collection[str]) -> list[str]:
     return [name for name in names if name.rpartition("/")[2] == value] or near_misses(value, names)
 
 
-def _several_values(key: str, text: str, types: dict[str, Any]) -> str:
+def _several_values(key: str, text: str, types: dict[str, object]) -> str:
     """The error for several values with commas, outside a sweep."""
     mistake = type_mistake(key, text, types.get(key)) or ""
     if "; write " in mistake:

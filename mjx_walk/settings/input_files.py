@@ -6,7 +6,6 @@ import json
 import shlex
 import warnings
 from pathlib import Path
-from typing import Any
 
 from mjx_walk.envs import TASKS, Task, TaskOptions
 from mjx_walk.envs.model_files import changed_names, model_path, source_hashes
@@ -17,7 +16,15 @@ from mjx_walk.storage.files import read_bytes, write_text
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["changed_input", "check_inputs", "check_model", "read_inputs", "save_inputs", "warn_of_changed_inputs"]
+__all__ = [
+    "Inputs",
+    "changed_input",
+    "check_inputs",
+    "check_model",
+    "read_inputs",
+    "save_inputs",
+    "warn_of_changed_inputs",
+]
 
 _MODEL, _REWARD, _TASK = "env.xml_file", "env.reward_function", "env.task"
 _MAX_BYTES = 10_000_000
@@ -152,7 +159,7 @@ def _read(folder: RunFolder) -> Inputs:
     return {}
 
 
-def _are_inputs(content: Any) -> bool:
+def _are_inputs(content: object) -> bool:
     if not isinstance(content, dict) or not all(isinstance(hashes, dict) for hashes in content.values()):
         return False
     hashes = {name: found for hashes in content.values() for name, found in hashes.items()}

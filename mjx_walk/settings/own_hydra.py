@@ -4,7 +4,7 @@ import contextlib
 import copy
 import threading
 from collections.abc import Iterator, MutableMapping
-from typing import Any
+from typing import Any, TypeVar
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -61,32 +61,36 @@ def own_hydra() -> Iterator[ConfigStore]:
                 BaseContainer._resolvers = resolvers
 
 
-class _OwnInOneThread(MutableMapping[Any, Any]):
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
+
+
+class _OwnInOneThread(MutableMapping[_Key, _Value]):
     """A dictionary that is another one in the thread that makes it."""
 
-    def __init__(self, everyones: dict[Any, Any], own: dict[Any, Any]):
+    def __init__(self, everyones: dict[_Key, _Value], own: dict[_Key, _Value]):
         self._everyones, self._own, self._owner = everyones, own, threading.get_ident()
 
     @property
-    def _present(self) -> dict[Any, Any]:
+    def _present(self) -> dict[_Key, _Value]:
         return self._own if threading.get_ident() == self._owner else self._everyones
 
-    def __getitem__(self, key: Any) -> Any:
+    def __getitem__(self, key: _Key) -> _Value:
         return self._present[key]
 
-    def __setitem__(self, key: Any, value: Any) -> None:
+    def __setitem__(self, key: _Key, value: _Value) -> None:
         self._present[key] = value
 
-    def __delitem__(self, key: Any) -> None:
+    def __delitem__(self, key: _Key) -> None:
         del self._present[key]
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[_Key]:
         return iter(self._present)
 
     def __len__(self) -> int:
         return len(self._present)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> dict[Any, Any]:
+    def __deepcopy__(self, memo: dict[int, object]) -> dict[_Key, _Value]:
         return copy.deepcopy(self._present, memo)
 
 

@@ -2,7 +2,6 @@
 
 import os
 from pathlib import Path
-from typing import Any
 
 from mjx_walk.envs.registry import (
     BUILT_IN_TASKS,
@@ -52,7 +51,7 @@ def take_task(command_line: list[str]) -> list[str]:
     return [argument for argument in command_line if argument.partition("=")[0] != KEY]
 
 
-def find_saved_task(name: Any, source: Any, config: Path) -> None:
+def find_saved_task(name: object, source: str | None, config: Path) -> None:
     """Make sure that the task of a saved configuration is registered. Its file runs only if the user trusts it.
 
     Args:

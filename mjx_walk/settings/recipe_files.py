@@ -133,17 +133,17 @@ def _store(path: Path, store: ConfigStore, above: tuple[Path, ...]) -> str:
     return name
 
 
-def _stored_default(entry: Any, path: Path, store: ConfigStore, above: tuple[Path, ...]) -> Any:
+def _stored_default(entry: object, path: Path, store: ConfigStore, above: tuple[Path, ...]) -> object:
     """An entry of a defaults list, under the name of its node if it is a file."""
     file = _inherited_file(entry, path)
     return _store(file, store, above) if file else entry
 
 
-def _is_override(entry: Any) -> bool:
+def _is_override(entry: object) -> bool:
     return isinstance(entry, dict) and any(str(key).startswith("override ") for key in entry)
 
 
-def _inherited_file(entry: Any, path: Path) -> Path | None:
+def _inherited_file(entry: object, path: Path) -> Path | None:
     """The file that an entry of a defaults list names. None for Hydra's keywords.
 
     Raises:
@@ -160,7 +160,7 @@ def _inherited_file(entry: Any, path: Path) -> Path | None:
     return file
 
 
-def _defaults(node: DictConfig, path: Path) -> list[Any]:
+def _defaults(node: DictConfig, path: Path) -> list[object]:
     entries = node.defaults
     if not isinstance(entries, ListConfig):
         raise UserError(f"{path}: its defaults are not a list; write '- NAME' in a line for each")

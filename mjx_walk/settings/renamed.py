@@ -1,9 +1,8 @@
 """Settings under former names, on command lines and in saved configurations."""
 
 import warnings
-from typing import Any
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 __all__ = ["present_key", "present_overrides", "under_present_names"]
 
@@ -40,7 +39,7 @@ def present_overrides(overrides: list[str]) -> list[str]:
     return present
 
 
-def under_present_names(saved: Any) -> Any:
+def under_present_names(saved: DictConfig) -> DictConfig:
     """Move the renamed settings of a saved configuration to their present names."""
     for old, new in _RENAMED.items():
         section, _, name = old.rpartition(".")

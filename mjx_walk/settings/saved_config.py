@@ -4,7 +4,7 @@ import dataclasses
 import operator
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -19,6 +19,7 @@ from mjx_walk.storage.files import write_text
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.saved_yaml import read_yaml
 from mjx_walk.utils.errors import UserError, first_line
+from mjx_walk.utils.setting_fields import Dataclass
 
 __all__ = [
     "MAY_DIFFER",
@@ -184,12 +185,15 @@ def in_short(differing: list[str]) -> str:
     return "; ".join([*named, *([f"and {num_others} more"] if num_others else [])])
 
 
-def name_same_file(old: Any, new: Any) -> bool:
+def name_same_file(old: object, new: object) -> bool:
     """Whether two paths, or two `PATH.py:NAME`, differ at most in the folder of the file."""
     return isinstance(old, str) and isinstance(new, str) and Path(old).name == Path(new).name
 
 
-def with_setting(settings: Any, key: str, value: Any) -> Any:
+_Settings = TypeVar("_Settings", bound=Dataclass)
+
+
+def with_setting(settings: _Settings, key: str, value: object) -> _Settings:
     """Replace a value of nested dataclasses by its key, such as `evaluation.films`."""
     name, _, rest = key.partition(".")
     own = with_setting(getattr(settings, name), rest, value) if rest else value

@@ -2,14 +2,14 @@
 
 import dataclasses
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import ENGINES
-from mjx_walk.utils.setting_fields import MAX_SEED, setting
+from mjx_walk.utils.setting_fields import MAX_SEED, Dataclass, setting
 
 __all__ = ["CheckpointConfig", "Config", "chosen", "setting_types"]
 
@@ -72,7 +72,7 @@ def chosen(overrides: list[str]) -> tuple[str, str]:
     return (env if env in TASKS else "humanoid"), (algo if algo in ALGORITHMS else "ppo")
 
 
-def setting_types(env: str, algo: str) -> dict[str, Any]:
+def setting_types(env: str, algo: str) -> dict[str, object]:
     """The annotation of every setting and of every group of settings, by its full key.
 
     Args:
@@ -82,7 +82,7 @@ def setting_types(env: str, algo: str) -> dict[str, Any]:
     return dict(_walk(Config, "", {"env": TASKS[env][1], "algo": ALGORITHMS[algo][1]}))
 
 
-def _walk(schema: Any, prefix: str, groups: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+def _walk(schema: Dataclass | type[Dataclass], prefix: str, groups: Mapping[str, type]) -> Iterator[tuple[str, object]]:
     hints = typing.get_type_hints(schema)
     for field in dataclasses.fields(schema):
         key = prefix + field.name

@@ -9,13 +9,12 @@ import os
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from mjx_walk.envs.user_files import changed_file, only_known, source_path
 from mjx_walk.storage.files import user_folder, write_text
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["remember", "require_trusted", "trust_file"]
+__all__ = ["Trusted", "remember", "require_trusted", "trust_file"]
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -101,7 +100,7 @@ def _read() -> Trusted | None:
     return None
 
 
-def _is_trusted(content: Any) -> bool:
+def _is_trusted(content: object) -> bool:
     if not isinstance(content, dict) or not all(isinstance(hashes, dict) for hashes in content.values()):
         return False
     return all(isinstance(found, str) for hashes in content.values() for found in hashes.values())

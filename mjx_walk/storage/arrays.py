@@ -14,7 +14,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 import tensorstore
@@ -22,7 +22,7 @@ import tensorstore
 from mjx_walk.storage.files import open_to_read, write_text
 from mjx_walk.utils.errors import UserError, failed_read
 
-__all__ = ["HostArrays", "read_arrays", "write_arrays"]
+__all__ = ["HostArrays", "ShapeAndDtype", "read_arrays", "write_arrays"]
 
 _NUMPY = "arrays.npz"
 """File that replaces Orbax's files for small pytrees, and in folders of earlier versions for other processes."""
@@ -34,6 +34,17 @@ _MAX_OVERHEAD, _MAX_OVERHEAD_OF_NUMPY = 100_000_000, 10_000_000
 and Python keeps each entry of an archive's directory there."""
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """What NumPy writes. Python would unpack other kinds without a limit of their memory."""
+
+
+class ShapeAndDtype(Protocol):
+    """An array, or a `jax.ShapeDtypeStruct`."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    @property
+    def dtype(self) -> np.dtype: ...
+
 
 HostArrays = dict[str, np.ndarray]
 """Host copies of a pytree's leaves, by path."""
@@ -60,7 +71,7 @@ def write_arrays(path: Path, arrays: HostArrays, as_numpy: bool = False) -> None
     write_text(path / _METADATA, json.dumps(_metadata_of_orbax(arrays)))
 
 
-def _write_tensorstore(base: dict[str, Any], arrays: HostArrays) -> None:
+def _write_tensorstore(base: dict[str, object], arrays: HostArrays) -> None:
     """Write all arrays in one transaction, each in one chunk, as Orbax does with its defaults.
 
     Orbax itself writes in an event loop of a thread. After a failed write its other writes continue, and print
@@ -89,7 +100,7 @@ def _write_tensorstore(base: dict[str, Any], arrays: HostArrays) -> None:
     transaction.commit_sync()
 
 
-def _metadata_of_orbax(arrays: HostArrays) -> dict[str, Any]:
+def _metadata_of_orbax(arrays: HostArrays) -> dict[str, object]:
     """What Orbax reads to restore the arrays as a dictionary."""
     value = {"value_type": "np.ndarray", "skip_deserialize": False}
     tree = {str((name,)): {"key_metadata": [{"key": name, "key_type": 2}], "value_metadata": value} for name in arrays}
@@ -117,7 +128,7 @@ def _as_os_error(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _store(path: Path) -> Iterator[dict[str, Any]]:
+def _store(path: Path) -> Iterator[dict[str, object]]:
     """Context manager for TensorStore's description of the files in a folder.
 
     TensorStore takes a backslash for a separator of folders, so a link without one leads to a path that has it.
@@ -132,7 +143,7 @@ def _store(path: Path) -> Iterator[dict[str, Any]]:
         yield {"driver": "ocdbt", "base": {"driver": "file", "path": f"{full}/"}}
 
 
-def read_arrays(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:
+def read_arrays(path: Path, expected: Mapping[str, ShapeAndDtype], present_name: Callable[[str], str]) -> HostArrays:
     """Read the expected arrays that a folder holds. Other arrays are not read.
 
     Args:
@@ -158,7 +169,7 @@ def read_arrays(path: Path, expected: Mapping[str, Any], present_name: Callable[
         raise ValueError(f"{path} is damaged: {reason}") from error
 
 
-def _read_numpy(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:
+def _read_numpy(path: Path, expected: Mapping[str, ShapeAndDtype], present_name: Callable[[str], str]) -> HostArrays:
     arrays: HostArrays = {}
     with open_to_read(path / _NUMPY) as content, zipfile.ZipFile(content) as archive:
         for member in archive.infolist():
@@ -170,7 +181,9 @@ def _read_numpy(path: Path, expected: Mapping[str, Any], present_name: Callable[
     return arrays
 
 
-def _read_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, expected: Any) -> np.ndarray:
+def _read_member(
+    path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, expected: ShapeAndDtype
+) -> np.ndarray:
     """Read an array of a NumPy archive, after a look at its header."""
     if member.compress_type not in _COMPRESSIONS:
         raise ValueError(f"{name} is compressed in a way that NumPy does not use")
@@ -189,7 +202,7 @@ def _read_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, 
     return array.view(expected.dtype) if dtype.kind == "V" else array  # NumPy's files do not support bfloat16
 
 
-def _read_orbax(path: Path, expected: Mapping[str, Any], present_name: Callable[[str], str]) -> HostArrays:
+def _read_orbax(path: Path, expected: Mapping[str, ShapeAndDtype], present_name: Callable[[str], str]) -> HostArrays:
     """Read Orbax's files with TensorStore, which shows the metadata of an array before it reads the array."""
     with _store(path) as base:
         context = tensorstore.Context()
@@ -212,14 +225,14 @@ def _read_orbax(path: Path, expected: Mapping[str, Any], present_name: Callable[
         return {name: np.asarray(future.result()) for name, future in reading.items()}
 
 
-def _check_size(path: Path, expected: Mapping[str, Any], overhead: int) -> None:
+def _check_size(path: Path, expected: Mapping[str, ShapeAndDtype], overhead: int) -> None:
     """Check that the files of a folder are not much larger than the expected arrays."""
     most = 2 * sum(math.prod(array.shape) * array.dtype.itemsize for array in expected.values()) + overhead
     if sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) > most:
         raise ValueError(f"it has more than {most:,} bytes, twice what its arrays have")
 
 
-def _check(path: Path, name: str, expected: Any, shape: tuple[int, ...], dtype: np.dtype) -> None:
+def _check(path: Path, name: str, expected: ShapeAndDtype, shape: tuple[int, ...], dtype: np.dtype) -> None:
     """Compare an array's declared shape and dtype with the expected ones."""
     wanted = expected.dtype
     is_bfloat16_in_numpy = wanted.kind == "V" and dtype == np.dtype(f"V{wanted.itemsize}")

@@ -3,9 +3,10 @@
 from collections.abc import Iterable
 from concurrent import futures
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mjx_walk.storage import checkpoint
+from mjx_walk.storage.checkpoint_metadata import Metadata
 
 __all__ = ["BackgroundSaver", "Part"]
 
@@ -14,8 +15,9 @@ class Part(NamedTuple):
     """Arguments of `checkpoint.save` for one folder."""
 
     path: Path
-    tree: Any
-    metadata: dict[str, Any]
+    tree: object
+    """Pytree of arrays."""
+    metadata: Metadata
 
 
 class BackgroundSaver:

@@ -8,14 +8,14 @@ import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Final, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mjx_walk.storage.arrays import HostArrays, read_arrays, write_arrays
-from mjx_walk.storage.checkpoint_metadata import FORMAT, read_metadata, write_metadata
+from mjx_walk.storage.checkpoint_metadata import FORMAT, Metadata, read_metadata, write_metadata
 from mjx_walk.storage.files import read_bytes, write_text
 from mjx_walk.storage.folders import discard, find_written, remove_unfinished, replacing_folder
 from mjx_walk.storage.saved_yaml import MAX_BYTES
@@ -23,12 +23,29 @@ from mjx_walk.storage.scores import POLICIES
 from mjx_walk.utils.errors import UnreadableError, UserError, failed_read
 from mjx_walk.utils.versions import __version__
 
+__all__ = [
+    "config_copy",
+    "discard_from",
+    "find",
+    "list_steps",
+    "present_name",
+    "prune",
+    "read_meta",
+    "restore",
+    "restore_newest",
+    "save",
+    "step_path",
+    "to_host",
+]
+
+_Tree = TypeVar("_Tree")
+
 _META = "meta.json"
 """File that is written last."""
 _ARRAYS = "arrays"
 _CONFIG = "run_config.yaml"
 """Copy of the run's configuration. Earlier versions wrote none."""
-_CONFIG_CHECKSUM = "config_crc32"
+_CONFIG_CHECKSUM: Final = "config_crc32"
 _REPLAY = "replay"
 """Field of the TrainState that only the newest checkpoint keeps, and the name of its folder."""
 
@@ -43,12 +60,12 @@ _RENAMED_LEAVES = {
 """Present paths of leaves, by the former paths in older checkpoints."""
 
 
-def to_host(tree: Any) -> HostArrays:
+def to_host(tree: object) -> HostArrays:
     """Copy a pytree to the host. The next program may then reuse its device memory."""
     return {name: np.array(leaf) for name, leaf in _named_leaves(jax.device_get(tree)).items()}
 
 
-def save(path: Path, tree: Any, meta: dict[str, Any], as_numpy: bool = False, config: str | None = None) -> None:
+def save(path: Path, tree: object, meta: Metadata, as_numpy: bool = False, config: str | None = None) -> None:
     """Write a pytree of arrays. The folder gets its name only when it is complete.
 
     Args:
@@ -101,7 +118,7 @@ def config_copy(path: Path) -> Path | None:
     return copy
 
 
-def restore(path: Path, like: Any) -> tuple[Any, dict[str, Any]]:
+def restore(path: Path, like: _Tree) -> tuple[_Tree, Metadata]:
     """Read a checkpoint that `save` wrote.
 
     Args:
@@ -155,7 +172,7 @@ def present_name(leaf: str) -> str:
     return leaf
 
 
-def read_meta(path: Path) -> dict[str, Any]:
+def read_meta(path: Path) -> Metadata:
     """Facts stored with a checkpoint.
 
     Raises:
@@ -176,11 +193,11 @@ def step_path(folder: Path, env_steps: int) -> Path:
 
 def restore_newest(
     folder: Path,
-    like: Any,
+    like: _Tree,
     part: Callable[[Path], Path] = lambda path: path,
     agree: Callable[[bool], bool] = lambda is_complete: is_complete,
     at_most: int | None = None,
-) -> tuple[Any, dict[str, Any]]:
+) -> tuple[_Tree, Metadata]:
     """Restore the newest complete checkpoint. Skips those that cannot be read, with a warning.
 
     Args:
@@ -219,7 +236,7 @@ def restore_newest(
     raise UserError(f"no usable checkpoint in {folder}; start a new run without resume=true")
 
 
-def _check_steps(path: Path, meta: dict[str, Any]) -> None:
+def _check_steps(path: Path, meta: Metadata) -> None:
     """Check that a checkpoint is the one that its name says. Facts of earlier versions have no checksum."""
     if meta["env_steps"] != int(path.name):
         raise ValueError(f"{path} is damaged: its metadata are of step {meta['env_steps']}")
@@ -256,6 +273,6 @@ def _crc32(array: np.ndarray) -> int:
     return zlib.crc32(np.ascontiguousarray(array).view(np.uint8).data)
 
 
-def _named_leaves(tree: Any) -> dict[str, Any]:
+def _named_leaves(tree: object) -> dict[str, jax.Array]:
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}

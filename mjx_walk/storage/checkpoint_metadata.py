@@ -3,14 +3,14 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, cast
 
 from mjx_walk.storage.checksums import read_json, take_checksum, with_checksum
 from mjx_walk.storage.files import write_text
 from mjx_walk.utils.errors import failed_read
 from mjx_walk.utils.versions import __version__
 
-__all__ = ["FORMAT", "read_metadata", "write_metadata"]
+__all__ = ["FORMAT", "Metadata", "read_metadata", "write_metadata"]
 
 FORMAT = 1
 """Version of the checkpoint format. Increment it when a change makes older checkpoints unreadable."""
@@ -20,13 +20,40 @@ _MAX_NUMBER = 1e300
 _REQUIRED = ("env_steps", "crc32")
 
 
-def write_metadata(path: Path, metadata: dict[str, Any]) -> None:
+class Metadata(TypedDict, total=False):
+    """Facts stored with a checkpoint or a policy, as JSON."""
+
+    format: int
+    """`FORMAT` of the version that wrote it."""
+    mjx_walk: str
+    """That version."""
+    env_steps: int
+    """Environment steps before it was saved, or, of the best policy, before its evaluation."""
+    wall_seconds: float
+    """Seconds of training so far."""
+    num_devices: int
+    """Devices that saved it."""
+    seeds_together: int
+    """Runs that trained in one program."""
+    eval_return: float
+    """Mean return of the evaluation that chose the policy."""
+    log_rows: int
+    """Rows of `metrics.jsonl` so far."""
+    log_crc32: int
+    """Their checksum."""
+    config_crc32: int
+    """Checksum of the copy of the configuration."""
+    crc32: dict[str, int]
+    """Checksums of the arrays, by path."""
+
+
+def write_metadata(path: Path, metadata: Metadata) -> None:
     """Write a `meta.json`, with the versions and a checksum."""
-    metadata = {"format": FORMAT, "mjx_walk": __version__} | metadata
-    write_text(path, json.dumps(with_checksum(metadata)))
+    content: dict[str, object] = {"format": FORMAT, "mjx_walk": __version__, **metadata}
+    write_text(path, json.dumps(with_checksum(content)))
 
 
-def read_metadata(path: Path) -> dict[str, Any]:
+def read_metadata(path: Path) -> Metadata:
     """Read a `meta.json`. Facts that this version does not know are not checked.
 
     Returns:
@@ -51,7 +78,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
             raise ValueError(f"{path}: {name} should be {valid}, found nothing")
     if not take_checksum(metadata) and metadata.get("format") == FORMAT:
         raise ValueError(f"{path.parent} is damaged: {path.name} does not match its checksum")
-    return metadata
+    return cast(Metadata, metadata)
 
 
 def _is_count(value: Any, at_least: int = 0) -> bool:
@@ -78,7 +105,7 @@ _FACTS: dict[str, tuple[Callable[[Any], bool], str]] = {
 """Facts of a checkpoint: whether a value is valid, and what is."""
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     """The start of a value, in one line."""
     if isinstance(value, int) and not _is_count(abs(value)):
         return "a huge number"  # Python refuses to print it

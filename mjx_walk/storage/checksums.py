@@ -3,7 +3,6 @@
 import json
 import zlib
 from pathlib import Path
-from typing import Any
 
 from mjx_walk.storage.files import read_bytes
 
@@ -14,7 +13,7 @@ _MAX_DEPTH = 20
 """Deepest nesting that is read. Python's JSON encoder supports far less nesting than its decoder."""
 
 
-def read_json(path: Path, max_bytes: int) -> Any:
+def read_json(path: Path, max_bytes: int) -> object:
     """Content of a JSON file.
 
     Raises:
@@ -30,12 +29,12 @@ def read_json(path: Path, max_bytes: int) -> Any:
     return content
 
 
-def with_checksum(content: dict[str, Any]) -> dict[str, Any]:
+def with_checksum(content: dict[str, object]) -> dict[str, object]:
     """A JSON object with a checksum of all its other members."""
     return content | {_KEY: _checksum(content)}
 
 
-def take_checksum(content: dict[str, Any]) -> bool:
+def take_checksum(content: dict[str, object]) -> bool:
     """Remove the checksum of a JSON object.
 
     Returns:
@@ -45,11 +44,11 @@ def take_checksum(content: dict[str, Any]) -> bool:
     return found is None or found == _checksum(content)
 
 
-def _checksum(content: dict[str, Any]) -> int:
+def _checksum(content: dict[str, object]) -> int:
     return zlib.crc32(json.dumps(content, sort_keys=True).encode())
 
 
-def _is_shallow(value: Any, depth: int) -> bool:
+def _is_shallow(value: object, depth: int) -> bool:
     if not isinstance(value, dict | list):
         return True
     parts = value.values() if isinstance(value, dict) else value

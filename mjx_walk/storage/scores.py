@@ -4,15 +4,16 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack, cast
 
 import numpy as np
 
+from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.storage.checksums import read_json, take_checksum, with_checksum
 from mjx_walk.storage.files import write_text
 from mjx_walk.utils.versions import package_versions
 
-__all__ = ["BEST", "BETTER", "FINAL", "POLICIES", "ScoreFile", "Scores", "read_scores", "write_scores"]
+__all__ = ["BEST", "BETTER", "FINAL", "POLICIES", "ScoreBlock", "ScoreFile", "Scores", "read_scores", "write_scores"]
 
 FINAL = "final"
 """The policy of the newest checkpoint, at the end of the training so far."""
@@ -56,11 +57,11 @@ class Scores:
             f"mean length {self.lengths.mean():,.1f}, lowest {self.returns.min():,.1f}"
         )
 
-    def block(self, **metadata: Any) -> dict[str, Any]:
+    def block(self, **metadata: Unpack[Metadata]) -> "ScoreBlock":
         """All episodes and their mean and deviation, for `write_scores`.
 
         Args:
-            metadata: JSON-serializable metadata about the policy, such as `env_steps`.
+            metadata: facts about the policy, such as `env_steps`.
         """
         return {
             "mean": self.mean,
@@ -72,23 +73,35 @@ class Scores:
         }
 
 
+class ScoreBlock(Metadata, total=False):
+    """Scores of one policy, as JSON, and facts about it."""
+
+    mean: float
+    """Mean return."""
+    std: float
+    """Standard deviation over episodes."""
+    returns: list[float]
+    lengths: list[int]
+    seeds: list[int]
+
+
 @dataclasses.dataclass(frozen=True)
 class ScoreFile:
     """Contents of an `eval_gymnasium.json`."""
 
     env: str
     """Gymnasium's id of the environment."""
-    blocks: dict[str, dict[str, Any]]
+    blocks: dict[str, ScoreBlock]
     """`Scores.block` of each scored policy, by its name: `final`, `best`, or `better` in a file with one block."""
     metadata: dict[str, Any]
     """Everything else, such as `versions`, `wall_seconds` and `command`."""
 
-    def block(self, *names: str) -> dict[str, Any] | None:
+    def block(self, *names: str) -> ScoreBlock | None:
         """The first block that the file has of these names."""
         return next((self.blocks[name] for name in names if name in self.blocks), None)
 
 
-def write_scores(path: Path, env: str, blocks: dict[str, dict[str, Any]], metadata: Mapping[str, Any]) -> None:
+def write_scores(path: Path, env: str, blocks: Mapping[str, ScoreBlock], metadata: Mapping[str, object]) -> None:
     """Write scores as JSON, with the versions of the packages and a checksum.
 
     Args:
@@ -129,7 +142,7 @@ def read_scores(path: Path) -> ScoreFile:
             raise ValueError(f"{path} has no mean and std of the policy '{name}'")
     if not isinstance(env, str) or not blocks:
         raise ValueError(f"{path} holds no scores")
-    return ScoreFile(env, blocks, content)
+    return ScoreFile(env, cast(dict[str, ScoreBlock], blocks), content)
 
 
 def _are_numbers(*values: Any) -> bool:

@@ -8,6 +8,8 @@ import jax
 
 from mjx_walk.utils.errors import first_line
 
+__all__ = ["CALLS_BEFORE", "CallProfile"]
+
 _LOGGER = logging.getLogger(__name__)
 
 CALLS_BEFORE = 2

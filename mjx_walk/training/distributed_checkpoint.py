@@ -1,19 +1,22 @@
 """Checkpoints of a run on several devices: the main process's in the run's folder, the others' in subfolders."""
 
 from pathlib import Path
-from typing import Any
+from typing import Final
 
 import jax
 import jax.numpy as jnp
 
 from mjx_walk.algos import TrainState
 from mjx_walk.storage import checkpoint
+from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.training.distributed import Processes
 from mjx_walk.utils.types import map_leaves_with
 
-NUM_DEVICES = "num_devices"
+__all__ = ["NUM_DEVICES", "SEEDS_TOGETHER", "device_folder", "restore_newest"]
+
+NUM_DEVICES: Final = "num_devices"
 """Key of a checkpoint's metadata: the number of devices that saved it."""
-SEEDS_TOGETHER = "seeds_together"
+SEEDS_TOGETHER: Final = "seeds_together"
 """Key of a checkpoint's metadata: the number of runs that trained in one program."""
 
 
@@ -24,7 +27,7 @@ def device_folder(checkpoints: Path, process_index: int) -> Path:
 
 def restore_newest(
     checkpoints: Path, like: TrainState, processes: Processes, at_most: int | None = None
-) -> tuple[TrainState, dict[str, Any]]:
+) -> tuple[TrainState, Metadata]:
     """The newest checkpoint that is complete on all devices, for as many devices as there are now.
 
     A device that joins starts with a copy of another one's part, under random keys of its own. The parts of devices

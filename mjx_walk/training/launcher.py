@@ -14,6 +14,8 @@ from mjx_walk.machine.signals import Interrupt, exit_code
 from mjx_walk.machine.subprocesses import python
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["count", "run"]
+
 _LOGGER = logging.getLogger(__name__)
 
 _PATIENCE = 20.0

@@ -7,6 +7,8 @@ from mjx_walk.algos import Algorithm
 from mjx_walk.machine.devices import device_memory, num_bytes
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["check_replay"]
+
 _USABLE = 0.9
 """Maximum fraction of the device's memory for the replay buffer."""
 

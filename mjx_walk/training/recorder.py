@@ -3,8 +3,7 @@
 import contextlib
 import logging
 import shlex
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator
 
 from mjx_walk.algos import Algorithm, TrainState
 from mjx_walk.envs import Task
@@ -17,12 +16,16 @@ from mjx_walk.settings.input_files import read_inputs, save_inputs
 from mjx_walk.settings.saved_config import as_yaml, save_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.background_saver import BackgroundSaver, Part
+from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import BEST, FINAL, Scores, write_scores
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.distributed_checkpoint import NUM_DEVICES, SEEDS_TOGETHER, device_folder, restore_newest
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.types import PolicyParams
 from mjx_walk.viewing.film import Filmer
+
+__all__ = ["Recorder"]
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -66,17 +69,17 @@ class Recorder:
             self._checkpoints, config.checkpoint.max_to_keep, as_yaml(config), prune_first=is_saved_with_others
         )
         self._best_iteration = -1
-        self._restored_metadata: Mapping[str, Any] = {}
+        self._restored_metadata: Metadata = {}
         self._writer: MetricsWriter | None = None
         self._wandb: WandbLog | None = None
         self._filmer = Filmer(config, folder) if config.evaluation.films else None
-        self._policies: dict[str, tuple[Any, dict[str, Any]]] = {}
+        self._policies: dict[str, tuple[PolicyParams, Metadata]] = {}
 
     @property
     def _is_main_process(self) -> bool:
         return self._processes.is_main_process
 
-    def restore(self, like: TrainState, at_most: int | None = None) -> tuple[TrainState, dict[str, Any]]:
+    def restore(self, like: TrainState, at_most: int | None = None) -> tuple[TrainState, Metadata]:
         """Restore the newest saved TrainState, and its `env_steps`, `wall_seconds` and `seeds_together`.
 
         Args:
@@ -114,7 +117,7 @@ class Recorder:
         if self._wandb:
             self._wandb.write(row)
 
-    def film(self, policy_params: Any, env_steps: int) -> None:
+    def film(self, policy_params: PolicyParams, env_steps: int) -> None:
         """Film a policy, if the configuration asks for films."""
         if self._filmer and self._is_main_process:
             with self._writing():
@@ -125,7 +128,7 @@ class Recorder:
 
         Saving a state with a replay buffer may take long.
         """
-        metadata = {
+        metadata: Metadata = {
             "env_steps": env_steps,
             "wall_seconds": wall_seconds,
             NUM_DEVICES: self._processes.process_count,
@@ -135,8 +138,8 @@ class Recorder:
             metadata |= self._writer.position
         parts = [Part(checkpoint.step_path(self._checkpoints, env_steps), state, metadata)]
         if self._is_main_process:
-            final = (self._algorithm.policy_params(state), {"env_steps": env_steps})
-            parts.insert(0, Part(self._folder.policy(FINAL), *final))
+            final = self._algorithm.policy_params(state)
+            parts.insert(0, Part(self._folder.policy(FINAL), final, {"env_steps": env_steps}))
             best = best_policy(state, self._steps_per_iteration)
             if best and int(state.evaluation.best_iteration) != self._best_iteration:
                 self._best_iteration = int(state.evaluation.best_iteration)
@@ -146,7 +149,7 @@ class Recorder:
                 self._writer.sync()
             self._saver.save(*parts)
 
-    def end(self, state: TrainState, env_steps: int, evaluate: Callable[[Any], float] | None) -> None:
+    def end(self, state: TrainState, env_steps: int, evaluate: Callable[[PolicyParams], float] | None) -> None:
         """Close the logs, draw the curves, and keep the policies that are to be scored.
 
         Args:
@@ -165,8 +168,8 @@ class Recorder:
             plot_run(self._folder)
         except (OSError, UserError) as error:
             _LOGGER.warning(f"cannot draw the curves of {self._folder.path}: {error}; draw them with mjx_walk.plots")
-        final: Any = self._algorithm.policy_params(state)
-        metadata: dict[str, Any] = {"env_steps": env_steps}
+        final = self._algorithm.policy_params(state)
+        metadata: Metadata = {"env_steps": env_steps}
         best = best_policy(state, self._steps_per_iteration)
         if evaluate:
             metadata |= {"eval_return": evaluate(final)}

@@ -3,6 +3,8 @@
 import collections
 import time
 
+__all__ = ["Speed"]
+
 _WINDOW = 10.0
 """Seconds over which the speed is averaged."""
 

@@ -3,14 +3,13 @@
 import re
 import sys
 from collections.abc import Mapping
-from typing import Any
 
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["check_class", "check_decorated", "identity"]
 
 
-def check_class(what: str, name: str, kind: Any, base: type, module: str, known: Mapping[str, type]) -> None:
+def check_class(what: str, name: str, kind: object, base: type, module: str, known: Mapping[str, type]) -> None:
     """Check a class that is to be registered.
 
     Args:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 from mjx_walk.utils.text import printable
 
+__all__ = ["UnreadableError", "UserError", "failed_read", "first_line"]
+
 _IS_DAMAGE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, None)
 
 

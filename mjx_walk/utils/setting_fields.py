@@ -6,8 +6,8 @@ import inspect
 import math
 import textwrap
 import typing
-from collections.abc import Iterable
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.value_types import type_problem
@@ -15,6 +15,7 @@ from mjx_walk.utils.value_types import type_problem
 __all__ = [
     "MAX_SEED",
     "AnyBut",
+    "Dataclass",
     "Row",
     "describe",
     "has_effect",
@@ -35,6 +36,12 @@ _MAX_ITEMS = 100
 """Values that a list may have. Each layer of a network takes its time to compile."""
 _MAX_INT = 10**12
 """No count is larger. JAX cannot hold shapes from 2**63 elements on, and some of its errors end the process."""
+
+
+class Dataclass(Protocol):
+    """An object of any dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
 
 
 class AnyBut(NamedTuple):
@@ -81,7 +88,7 @@ def with_name(schema: type[Schema], name: str) -> type[Schema]:
     return dataclasses.make_dataclass(schema.__name__, [field], bases=(schema,))
 
 
-def validate(config: Any, prefix: str = "") -> None:
+def validate(config: Dataclass | type[Dataclass], prefix: str = "") -> None:
     """Check the types and ranges of all settings of a dataclass and of the dataclasses in it.
 
     Raises:
@@ -105,7 +112,7 @@ def validate(config: Any, prefix: str = "") -> None:
                 raise UserError(f"{key}={value}: {problem}")
 
 
-def _problem(value: Any, limits: Any) -> str | None:
+def _problem(value: Any, limits: Mapping[str, Any]) -> str | None:
     if value is None:
         return None
     if isinstance(value, float) and math.isnan(value):
@@ -128,7 +135,7 @@ def _problem(value: Any, limits: Any) -> str | None:
     return None
 
 
-def refuse_ineffective(config: Any, keys: Iterable[str]) -> None:
+def refuse_ineffective(config: object, keys: Iterable[str]) -> None:
     """Check that explicitly given settings have an effect under the values of the others.
 
     Args:
@@ -149,7 +156,7 @@ def refuse_ineffective(config: Any, keys: Iterable[str]) -> None:
         raise UserError(f"{key}={_as_yaml(getattr(owner, name))} has no effect {reason} leave it out")
 
 
-def has_effect(config: Any, key: str) -> bool:
+def has_effect(config: object, key: str) -> bool:
     """Whether a setting has an effect under the values of the others.
 
     Args:
@@ -159,7 +166,7 @@ def has_effect(config: Any, key: str) -> bool:
     return _blockers(*_find(config, key)) is None
 
 
-def _find(config: Any, key: str) -> tuple[Any, str]:
+def _find(config: object, key: str) -> tuple[object, str]:
     """The dataclass that holds a setting, and the setting's name in it."""
     *sections, name = key.split(".")
     for section in sections:
@@ -167,7 +174,7 @@ def _find(config: Any, key: str) -> tuple[Any, str]:
     return config, name
 
 
-def _blockers(owner: Any, name: str) -> list[str] | None:
+def _blockers(owner: object, name: str) -> list[str] | None:
     """The settings whose values disable a setting, or None if it has an effect."""
     fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
     conditions = next((field.metadata.get("only_if") for field in fields if field.name == name), None)
@@ -250,13 +257,13 @@ def meanings(schema: type) -> dict[str, str]:
     return found
 
 
-def _range(limits: Any) -> str:
+def _range(limits: Mapping[str, Any]) -> str:
     words = {"above": "above", "at_least": "at least", "at_most": "at most", "below": "below"}
     bounds = " and ".join(f"{word} {limits[name]}" for name, word in words.items() if name in limits)
     return bounds or "|".join(limits.get("choices", ()))
 
 
-def _as_text(conditions: dict[str, Any]) -> str:
+def _as_text(conditions: dict[str, object]) -> str:
     alternatives = [
         f"{other} other than {_as_yaml(wanted.value)}" if isinstance(wanted, AnyBut) else f"{other}={_as_yaml(wanted)}"
         for other, wanted in conditions.items()
@@ -264,7 +271,7 @@ def _as_text(conditions: dict[str, Any]) -> str:
     return " or ".join(alternatives)
 
 
-def _as_yaml(value: Any) -> str:
+def _as_yaml(value: object) -> str:
     if isinstance(value, list | tuple):
         return f"[{','.join(map(_as_yaml, value))}]"
     return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))

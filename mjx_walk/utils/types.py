@@ -2,22 +2,31 @@
 
 import dataclasses
 import enum
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias, TypeVar
 
 import flax
 import jax
 import jax.numpy as jnp
+import numpy as np
+from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.types import Transition
+from jax import Array
+from jaxtyping import Float, PRNGKeyArray
 
 __all__ = [
     "ITERATION_COUNT",
     "PER_DEVICE",
     "RANDOM_KEY",
     "REPLAY",
+    "Act",
+    "Losses",
     "Metric",
     "Metrics",
+    "Params",
     "PolicyFn",
+    "PolicyParams",
+    "PyTree",
     "Reduction",
     "Transition",
     "as_means",
@@ -25,8 +34,22 @@ __all__ = [
     "map_leaves_with",
 ]
 
-PolicyFn = Callable[[jax.Array, jax.Array], jax.Array]
-"""`(obs [B, observation_size], key) → action [B, action_size]`, in Gymnasium's units on both sides."""
+PyTree: TypeAlias = Any
+"""A JAX pytree of any structure, of arrays or of their shapes."""
+
+Params: TypeAlias = Mapping[str, PyTree]
+"""Parameters of a network: nested dictionaries of arrays."""
+
+PolicyParams: TypeAlias = tuple[RunningStatisticsState, Params]
+"""Observation normalizer and parameters of the policy. Saved policies name their arrays after this structure."""
+
+PolicyFn = Callable[[Float[Array, "B observation_size"], PRNGKeyArray], Float[Array, "B action_size"]]
+"""`(obs, key) → action`, in Gymnasium's units on both sides."""
+
+Act = Callable[[Float[Array | np.ndarray, "*batch observation_size"]], Float[Array, "*batch action_size"]]
+"""`obs → action` of a deterministic policy, in Gymnasium's units, for one environment or a batch."""
+
+_Tree = TypeVar("_Tree")
 
 
 class Reduction(enum.Enum):
@@ -53,7 +76,7 @@ class Metric(flax.struct.PyTreeNode):
 
     NaN does not stand for a missing value, because `JAX_DEBUG_NANS=1` stops at every NaN."""
 
-    def only_if(self, condition: jax.Array) -> "Metric":
+    def only_if(self, condition: Array) -> "Metric":
         """The metric with a value only where a condition, `[] bool`, holds too."""
         has_value = condition if self.has_value is None else condition & self.has_value
         return self.replace(value=jnp.where(has_value, self.value, 0.0), has_value=has_value)
@@ -63,7 +86,11 @@ Metrics = dict[str, Metric]
 """Metrics by the names under which they are logged."""
 
 
-def as_means(values: dict[str, jax.Array]) -> Metrics:
+Losses = dict[str, Float[Array, ""]]
+"""Losses and other numbers of one update, by the names of their metrics."""
+
+
+def as_means(values: Losses) -> Metrics:
     """Metrics that are means over iterations."""
     return {name: Metric(value, Reduction.MEAN) for name, value in values.items()}
 
@@ -78,7 +105,7 @@ ITERATION_COUNT = {"iteration_count": True}
 """A count of iterations, whose environment steps depend on the number of devices."""
 
 
-def leaves_with(tree: Any, key: str) -> list[bool]:
+def leaves_with(tree: PyTree, key: str) -> list[bool]:
     """For each leaf of a pytree, in order: whether its field, or a field around it, has metadata of this key."""
     flags: list[bool] = []
     for node in jax.tree.leaves(tree, is_leaf=dataclasses.is_dataclass):
@@ -93,7 +120,7 @@ def leaves_with(tree: Any, key: str) -> list[bool]:
     return flags
 
 
-def map_leaves_with(function: Callable[..., Any], key: str, tree: Any, *others: Any) -> Any:
+def map_leaves_with(function: Callable[..., object], key: str, tree: _Tree, *others: PyTree) -> _Tree:
     """Apply a function to the leaves whose field has metadata of this key. Others are those of the first tree."""
     leaves, structure = jax.tree.flatten(tree)
     columns = zip(leaves, *map(jax.tree.leaves, others), strict=True)

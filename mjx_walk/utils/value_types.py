@@ -19,14 +19,14 @@ _PLAIN = {
     str: ("must be a string", (str, os.PathLike)),
 }
 """For each type of a setting, what is said of other values, and the types of valid ones."""
-_PLURALS = {int: "integers", float: "numbers", str: "names", bool: "values true or false"}
+_PLURALS: dict[object, str] = {int: "integers", float: "numbers", str: "names", bool: "values true or false"}
 _NUMBER = r"[+-]?\d[\d_]*(\.\d*)?([eE][+-]?\d+)?"
 _MOST_DIGITS = 30
 """Larger numbers stay as they are: none is valid."""
 _UNITS = {"k": 1_000, "m": 1_000_000, "b": 1_000_000_000}
 
 
-def plain_type(hint: Any) -> Any:
+def plain_type(hint: object) -> object:
     """The type of a setting without `| None`."""
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
         kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
@@ -34,7 +34,7 @@ def plain_type(hint: Any) -> Any:
     return hint
 
 
-def type_problem(value: Any, hint: Any) -> str | None:
+def type_problem(value: object, hint: object) -> str | None:
     """What is wrong with the type of a value, or None. Types that no setting of this package has are not checked.
 
     Args:
@@ -52,12 +52,13 @@ def type_problem(value: Any, hint: Any) -> str | None:
         return None if isinstance(value, kind) else _must_be(kind)  # type: ignore[arg-type]
     if typing.get_origin(kind) is tuple:
         items, length = _items(kind)
-        is_list = isinstance(value, list | tuple | np.ndarray) and length in (None, len(value))
-        return None if is_list and not any(type_problem(item, items) for item in value) else _must_be(kind)
+        if not isinstance(value, list | tuple | np.ndarray) or length not in (None, len(value)):
+            return _must_be(kind)
+        return _must_be(kind) if any(type_problem(item, items) for item in value) else None
     return None
 
 
-def type_mistake(key: str, text: str, hint: Any) -> str | None:
+def type_mistake(key: str, text: str, hint: object) -> str | None:
     """The error for a text that is not of its setting's type, and what to type instead. None for unknown types.
 
     Args:
@@ -86,7 +87,7 @@ def with_whole_number(text: str) -> str:
     return str(int(number)) if re.search(r"[.eE]", text) else text
 
 
-def _correction(key: str, text: str, kind: Any) -> str:
+def _correction(key: str, text: str, kind: object) -> str:
     """What to type instead of a text, if it can be guessed."""
     if kind is int:
         in_units = re.fullmatch(rf"({_NUMBER})([kKmMbB])", text)
@@ -97,13 +98,14 @@ def _correction(key: str, text: str, kind: Any) -> str:
     if typing.get_origin(kind) is tuple:
         items, length = _items(kind)
         parts = text.strip("()[] ,").split(",")
-        pattern = {int: r"\s*[+-]?\d+\s*", float: rf"\s*{_NUMBER}\s*"}.get(items, ".+")
+        patterns: dict[object, str] = {int: r"\s*[+-]?\d+\s*", float: rf"\s*{_NUMBER}\s*"}
+        pattern = patterns.get(items, ".+")
         if all(re.fullmatch(pattern, part) for part in parts) and length in (None, len(parts)):
             return f"; write {key}=[{','.join(part.strip() for part in parts)}]"
     return ""
 
 
-def _must_be(kind: Any) -> str | None:
+def _must_be(kind: object) -> str | None:
     if kind in _PLAIN:
         return _PLAIN[kind][0]
     if dataclasses.is_dataclass(kind):
@@ -116,7 +118,7 @@ def _must_be(kind: Any) -> str | None:
     return None
 
 
-def _items(kind: Any) -> tuple[Any, int | None]:
+def _items(kind: object) -> tuple[object, int | None]:
     """The type of a tuple's items, and their number unless any number is valid."""
     kinds = typing.get_args(kind)
     return (kinds[0], None) if kinds[-1] is Ellipsis else (kinds[0] if len(set(kinds)) == 1 else Any, len(kinds))

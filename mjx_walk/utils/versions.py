@@ -3,6 +3,8 @@
 import importlib.metadata
 import platform
 
+__all__ = ["package_versions"]
+
 __version__ = "0.1.0"
 
 _PACKAGES = ("gymnasium", "mujoco", "mujoco-mjx", "warp-lang", "jax", "brax", "numpy")

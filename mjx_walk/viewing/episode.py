@@ -17,6 +17,8 @@ from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.viewing.rendering import choose_opengl
 from mjx_walk.viewing.task_env import TaskEnv
 
+__all__ = ["Episode", "camera_settings", "make_gymnasium", "record_episode"]
+
 _FLOOR_SCALE = 20.0
 """MuJoCo draws a plane only as large as its `size`; a fast runner leaves it after 3 seconds."""
 
@@ -129,13 +131,13 @@ def make_gymnasium(task: Task, **keywords: Any) -> gymnasium.Env:
     if not task.is_in_gymnasium:
         return TaskEnv(task, **keywords)
     warn_of_changed_sources(task.model_file, task.model_sources)
-    options = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
+    options: dict[str, Any] = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
     with hide_deprecations(), warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
         return gymnasium.make(task.gymnasium_id, **options, **keywords)
 
 
-def camera_settings(view: View) -> dict[str, Any]:
+def camera_settings(view: View) -> dict[str, object]:
     """Fields of MuJoCo's camera for a view. Gymnasium 1.4's own default stands still and films an empty floor."""
     settings: dict[str, Any] = {
         "distance": view.distance,

@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import imageio.v3 as iio
 import jax
@@ -20,8 +19,11 @@ from mjx_walk.settings.saved_config import save_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import FINAL
+from mjx_walk.utils.types import PolicyParams
 from mjx_walk.viewing.episode import record_episode
 from mjx_walk.viewing.rendering import write_film
+
+__all__ = ["Filmer", "film"]
 
 _SIZE = (320, 240)
 _FRAMES_PER_SECOND = 25.0
@@ -43,7 +45,7 @@ class Filmer:
         self._folder = folder
         self._process: subprocess.Popen | None = None
 
-    def take(self, policy_params: Any, env_steps: int) -> None:
+    def take(self, policy_params: PolicyParams, env_steps: int) -> None:
         """Start to film a policy, unless the previous film is still being made."""
         if self._process and self._process.poll() is None:
             return

@@ -14,6 +14,8 @@ from mjx_walk.utils.text import format_score
 from mjx_walk.viewing.episode import Episode
 from mjx_walk.viewing.figures import standard_style
 
+__all__ = ["draw_gait_sheet", "frame_strip"]
+
 _NUM_FRAMES = 8
 _STRIP_SECONDS = 1.0
 _DETAIL_SECONDS = 3.0

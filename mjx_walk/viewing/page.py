@@ -6,7 +6,6 @@ import json
 import re
 import string
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,6 +15,8 @@ from mjx_walk.storage.files import write_text
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.text import format_score
 from mjx_walk.viewing.episode import Episode
+
+__all__ = ["require_library", "write_page"]
 
 _TEMPLATE = Path(__file__).with_name("page.html")
 _SHAPES = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
@@ -68,7 +69,7 @@ def write_page(episode: Episode, path: Path) -> Path:
     return path
 
 
-def _camera(episode: Episode) -> dict[str, Any]:
+def _camera(episode: Episode) -> dict[str, object]:
     """The point that stays in the middle of the page, and the camera's place relative to it.
 
     The point moves with the body if the view follows it; then it is at 0.6 of the body's greatest height. Places are in
@@ -101,7 +102,7 @@ def _body_poses(episode: Episode) -> np.ndarray:
     return poses
 
 
-def _geoms(model: mujoco.MjModel) -> list[dict[str, Any]]:
+def _geoms(model: mujoco.MjModel) -> list[dict[str, object]]:
     """The visible geoms, without planes, height fields and signed distance functions."""
     geoms = []
     for i in range(model.ngeom):

@@ -16,6 +16,8 @@ from mjx_walk.machine.subprocesses import python
 from mjx_walk.storage.files import replacing
 from mjx_walk.utils.errors import UserError
 
+__all__ = ["choose_opengl", "write_film"]
+
 _RENDERERS = ("egl", "osmesa", "glfw")
 """Values of `MUJOCO_GL` that Gymnasium renders with; the last one needs a screen."""
 _PROBE = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 64, 64).render()"

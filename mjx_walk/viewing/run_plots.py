@@ -16,6 +16,8 @@ from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.figures import standard_style
 
+__all__ = ["THOUSANDS", "evaluations", "learning_axes", "plot_run", "series"]
+
 _X_AXES = (("env_steps", 1e6, "million environment steps"), ("wall_seconds", 1.0, "seconds since start"))
 """Key of a row, unit and label of each horizontal axis."""
 THOUSANDS = matplotlib.ticker.StrMethodFormatter("{x:,.10g}")

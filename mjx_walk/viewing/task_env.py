@@ -1,7 +1,6 @@
 """A task of a user as a Gymnasium environment with a MuJoCo simulation to draw."""
 
 import copy
-from typing import Any
 
 import gymnasium
 import jax
@@ -10,6 +9,8 @@ import numpy as np
 from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
 from mjx_walk.envs import State, Task
+
+__all__ = ["TaskEnv"]
 
 
 class TaskEnv(gymnasium.Env):
@@ -33,7 +34,7 @@ class TaskEnv(gymnasium.Env):
         self._reset, self._step = jax.jit(task.reset), jax.jit(task.step)
         self._state: State | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: int | None = None, options: dict[str, object] | None = None):
         """Start an episode at random."""
         super().reset(seed=seed)
         self._state = self._reset(jax.random.PRNGKey(seed or 0))

@@ -12,6 +12,8 @@ from mjx_walk.envs import Task
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.episode import camera_settings, make_gymnasium
 
+__all__ = ["show"]
+
 
 def show(task: Task, policy: Callable[[np.ndarray], np.ndarray], seed: int = 0) -> None:
     """Play episodes in real time until the user closes the window.

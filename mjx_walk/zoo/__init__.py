@@ -14,6 +14,8 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.text import format_score
 
+__all__ = ["PREFIX", "empty_folder", "holds", "names", "open_run", "output_path", "table"]
+
 PREFIX = "zoo:"
 
 _FOLDER = Path(__file__).parent

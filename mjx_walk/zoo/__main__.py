@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-from typing import Any
 
 import jax
 
@@ -15,6 +14,9 @@ from mjx_walk.storage import checkpoint
 from mjx_walk.storage.scores import BEST, write_scores
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
+from mjx_walk.utils.types import PolicyParams
+
+__all__ = ["USAGE", "Arguments", "main"]
 
 USAGE = """
 usage: python -m mjx_walk.zoo
@@ -70,7 +72,7 @@ def main(command_line: list[str]) -> None:
     print(scores)
 
 
-def _rounded_to(dtype: str, policy_params: Any) -> Any:
+def _rounded_to(dtype: str, policy_params: PolicyParams) -> PolicyParams:
     """Round weights to the precision that the networks learned with; the zeros of bfloat16 compress well."""
     normalizer, params = policy_params
     return normalizer, jax.tree.map(lambda x: x.astype(dtype).astype(x.dtype), params)

@@ -11,7 +11,7 @@ from brax.training.agents.sac import train as brax_sac
 from helpers import values
 from toy_tasks import BraxSizes, ToyTask
 
-from mjx_walk.algos.off_policy import Batch
+from mjx_walk.algos.off_policy_state import Batch
 from mjx_walk.algos.sac import SAC, SACConfig
 from mjx_walk.common.replay_buffer import ReplayBuffer
 from mjx_walk.envs import make_env

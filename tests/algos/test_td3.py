@@ -8,7 +8,7 @@ import pytest
 from toy_tasks import ToyTask
 
 from mjx_walk.algos.ddpg import DDPG, DDPGConfig
-from mjx_walk.algos.off_policy import Batch
+from mjx_walk.algos.off_policy_state import Batch
 from mjx_walk.algos.td3 import TD3, TD3Config
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.types import Transition

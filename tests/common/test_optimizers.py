@@ -9,7 +9,9 @@ from mjx_walk.common.optimizers import anneal_discount, remaining_fraction, sche
 def test_a_schedule_ends_at_its_horizon():
     left = [float(remaining_fraction(jnp.float32(steps), 200)) for steps in (0, 50, 200, 300)]
     assert left == pytest.approx([1.0, 0.75, 0.0, 0.0])
-    assert schedule_factor("linear", 0.25) == 0.25 and schedule_factor("constant", 0.25) == 1.0
+    assert (
+        schedule_factor("linear", jnp.float32(0.25)) == 0.25 and schedule_factor("constant", jnp.float32(0.25)) == 1.0
+    )
 
 
 def test_a_discounts_horizon_changes_by_the_same_factor_every_step():
