@@ -6,15 +6,7 @@ a test fails if a committed page differs.
 
 from pathlib import Path
 
-from generator import (
-    best_recipes,
-    scaling,
-    score_tables,
-    seed_tables,
-    setting_tables,
-    speed_tables,
-    task_pages,
-)
+from generator import best_recipes, measured_tables, scaling, score_tables, seed_tables, setting_tables, task_pages
 from generator.markdown import with_block
 
 from mjx_walk import zoo
@@ -42,14 +34,14 @@ def pages() -> dict[Path, str]:
 
 def _figures() -> dict[str, dict[str, str]]:
     """The tables of the pages of measurements, by page and block."""
-    measured = {name: speed_tables.drawn(name) for name in speed_tables.names()}
+    measured, archived = measured_tables.all_in("."), measured_tables.all_in("archive")
     scores = {"all-tasks": best_recipes.detailed(), "comparison": best_recipes.comparison()}
     scores |= {"recipes": score_tables.recipes(), "suite": score_tables.suite(), "zoo": zoo.table()}
     scores |= {"published": score_tables.published(True), "published-runs": score_tables.published(False)}
     scores |= {"csac-seeds": seed_tables.csac_seeds(), "csac-means": seed_tables.csac_means()}
     scores |= {"fresh-seeds": seed_tables.other_algorithms(), "ppo-suite": seed_tables.ppo_on_other_tasks()}
     scores |= {name: measured.pop(name) for name in ("cpu", "cpu_tasks", "installation")}
-    archived = {"six-algorithms": seed_tables.six_algorithms()}
+    archived["six-algorithms"] = seed_tables.six_algorithms()
     speeds = {"scaling": scaling.detailed(), **measured}
     return {"results.md": scores, "speed.md": speeds, "results_archive.md": archived}
 

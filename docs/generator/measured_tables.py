@@ -1,4 +1,4 @@
-"""Tables of measured/*.csv: speeds, times, memory, and scores on a CPU.
+"""Tables of the files in measured/: speeds, times, memory, scores on a CPU, and those of the archive.
 
 A file has a table's titles and rows. An empty cell was not measured.
 """
@@ -15,24 +15,28 @@ _JOINED = ("complete_runs",)
 """Files whose rows are completed from experiments.csv."""
 
 
-def names() -> list[str]:
-    """Names of the tables, which are those of their files."""
-    return sorted(path.stem for path in FOLDER.glob("*.csv"))
+def all_in(folder: str) -> dict[str, str]:
+    """The tables of a folder, by the names of their files.
+
+    Args:
+        folder: relative to measured/.
+    """
+    return {path.stem: _drawn(path) for path in sorted((FOLDER / folder).glob("*.csv"))}
 
 
-def drawn(name: str) -> str:
-    """A table of the folder."""
-    if name in _JOINED:
+def _drawn(path: Path) -> str:
+    if path.stem in _JOINED:
         return _complete_runs()
-    titles, *rows = _cells(name)
+    titles, *rows = _cells(path)
     columns = list(zip(*rows, strict=True))
-    aligned = [f">{title}" if all(map(_is_number, column)) else title for title, column in zip(titles, columns, strict=True)]
+    right = [">" * all(map(_is_number, column)) for column in columns]
+    aligned = [mark + title for mark, title in zip(right, titles, strict=True)]
     return table(aligned, [[_shown(cell) for cell in row] for row in rows])
 
 
 def _complete_runs() -> str:
     """Training runs of PPO on Humanoid, each alone on a GPU."""
-    log: dict[tuple[str, str], dict[str, str]] = {(row["id"], row["measure"]): row for row in read("experiments.csv")}
+    log = {(row["id"], row["measure"]): row for row in read("experiments.csv")}
     rows = []
     for run in read("measured/complete_runs.csv"):
         speed, score = log[run["id"], "speed"], log[run["id"], "gymnasium"]
@@ -42,8 +46,8 @@ def _complete_runs() -> str:
     return table((*titles, ">Score", ">Std over episodes"), rows)
 
 
-def _cells(name: str) -> list[list[str]]:
-    with (FOLDER / f"{name}.csv").open(newline="", encoding="utf-8") as file:
+def _cells(path: Path) -> list[list[str]]:
+    with path.open(newline="", encoding="utf-8") as file:
         return list(csv.reader(file, strict=True))
 
 
@@ -52,4 +56,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _shown(cell: str) -> str:
-    return f"{int(cell):,}" if re.fullmatch(r"-?\d+", cell) else cell or "–"
+    if not re.fullmatch(r"-?\d+(\.\d+)?", cell):
+        return cell or "–"
+    integer, point, fraction = cell.partition(".")
+    return f"{int(integer):,}{point}{fraction}" if abs(int(integer)) >= 1000 else cell
