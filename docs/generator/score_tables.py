@@ -98,20 +98,18 @@ def suite() -> str:
         ">Random actions",
         ">SLM-Lab",
     )
-    return f"{table(titles, rows)}\n\n{_normalized(arms)}"
+    heading = 'Scores over all tasks, with 0 for random actions and 1 for "SLM-Lab":'
+    return f"{table(titles, rows)}\n\n{heading}\n\n{_normalized(arms)}"
 
 
 def _normalized(arms: dict[str, dict[str, str]]) -> str:
     """The normalized scores over all tasks of the final and of the best policies."""
-    means = []
-    for suffix in ("", "@best"):
+    lines = []
+    for policies, suffix in (("final", ""), ("best", "@best")):
         rows = [row for name, row in arms.items() if _SUITE.fullmatch(name.removesuffix(suffix)) and suffix in name]
         scores = [normalize(f"{row['task']}-{row['version']}", float(row["final_mean"])) for row in rows]
-        means += [f"{np.mean(scores):.2f}", f"{scipy.stats.trim_mean(scores, 0.25):.2f}"]
-    return (
-        'With 0 for random actions and 1 for "SLM-Lab", the final policies have '
-        f"a mean of {means[0]} and an interquartile mean of {means[1]}, the best ones {means[2]} and {means[3]}."
-    )
+        lines.append([policies, f"{np.mean(scores):.2f}", f"{scipy.stats.trim_mean(scores, 0.25):.2f}"])
+    return table(("Policies", ">Mean", ">Interquartile mean"), lines)
 
 
 def read(name: str) -> list[dict[str, str]]:
