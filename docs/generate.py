@@ -6,7 +6,7 @@ a test fails if a committed page differs.
 
 from pathlib import Path
 
-from generator import scaling, score_tables, seed_tables, setting_tables, task_pages
+from generator import best_recipes, measured_tables, scaling, score_tables, seed_tables, setting_tables, task_pages
 from generator.markdown import with_block
 
 from mjx_walk import zoo
@@ -14,6 +14,8 @@ from mjx_walk.algos import BUILT_IN_ALGORITHMS
 from mjx_walk.envs import BUILT_IN_TASKS
 
 DOCS = Path(__file__).parent
+_OF_SCORES = ("best_evaluations", "complete_episodes", "cpu", "cpu_tasks", "installation", "slm_lab_drafts")
+"""Tables of measured/ that results.md shows. speed.md shows the others."""
 
 
 def pages() -> dict[Path, str]:
@@ -21,19 +23,29 @@ def pages() -> dict[Path, str]:
     found = {DOCS / "tasks" / f"{name}.md": task_pages.page(name) for name in BUILT_IN_TASKS}
     found[DOCS / "tasks" / "index.md"] = _filled("tasks/index.md", {"tasks": task_pages.overview_of_all()})
     groups = {name: setting_tables.group_table(name) for name in setting_tables.GROUPS}
-    found[DOCS.parent / "README.md"] = _filled("../README.md", {"best": score_tables.best()})
-    scores = {"recipes": score_tables.recipes(), "suite": score_tables.suite(), "zoo": zoo.table()}
-    scores |= {"published": score_tables.published(True), "published-runs": score_tables.published(False)}
-    scores |= {"csac-seeds": seed_tables.csac_seeds(), "csac-means": seed_tables.csac_means()}
-    scores |= {"fresh-seeds": seed_tables.other_algorithms(), "ppo-suite": seed_tables.ppo_on_other_tasks()}
-    scores |= {"six-algorithms": seed_tables.six_algorithms(), "scaling": scaling.detailed()}
-    found[DOCS / "results.md"] = _filled("results.md", scores)
+    found[DOCS.parent / "README.md"] = _filled("../README.md", {"best": best_recipes.summary()})
+    for page, blocks in _figures().items():
+        found[DOCS / page] = _filled(page, blocks)
     found[DOCS / "training.md"] = _filled("training.md", {"scaling-summary": scaling.summary()})
     found[DOCS / "configuration.md"] = _filled("configuration.md", groups)
     for name in BUILT_IN_ALGORITHMS:
         blocks = {"settings": setting_tables.algorithm_table(name), "scores": score_tables.of_algorithm(name)}
         found[DOCS / "algorithms" / f"{name}.md"] = _filled(f"algorithms/{name}.md", blocks)
     return found
+
+
+def _figures() -> dict[str, dict[str, str]]:
+    """The tables of the pages of measurements, by page and block."""
+    measured, archived = measured_tables.all_in("."), measured_tables.all_in("archive")
+    scores = {"all-tasks": best_recipes.detailed(), "comparison": best_recipes.comparison()}
+    scores |= {"recipes": score_tables.recipes(), "suite": score_tables.suite(), "zoo": zoo.table()}
+    scores |= {"published": score_tables.published(True), "published-runs": score_tables.published(False)}
+    scores |= {"csac-seeds": seed_tables.csac_seeds(), "csac-means": seed_tables.csac_means()}
+    scores |= {"fresh-seeds": seed_tables.other_algorithms(), "ppo-suite": seed_tables.ppo_on_other_tasks()}
+    scores |= {name: measured.pop(name) for name in _OF_SCORES}
+    archived["six-algorithms"] = seed_tables.six_algorithms()
+    speeds = {"scaling": scaling.detailed(), **measured}
+    return {"results.md": scores, "speed.md": speeds, "results_archive.md": archived}
 
 
 def _filled(name: str, blocks: dict[str, str]) -> str:

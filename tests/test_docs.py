@@ -26,11 +26,18 @@ def test_committed_pages_are_what_the_code_gives():
     assert not stale, "run python docs/generate.py, and commit its changes"
     names = {Path(os.path.relpath(path, DOCS)).as_posix() for path in pages}
     assert names == {
-        *("../README.md", "results.md", "training.md"),
+        *("../README.md", "results.md", "results_archive.md", "speed.md", "training.md"),
         *(f"tasks/{name}.md" for name in ("index", *BUILT_IN_TASKS)),
         *(f"algorithms/{name}.md" for name in BUILT_IN_ALGORITHMS),
         "configuration.md",
     }
+
+
+def test_every_table_is_generated():
+    """On the pages of figures, apart from those that explain columns."""
+    for name in ("results.md", "results_archive.md", "speed.md"):
+        text = re.sub(r"<!-- Generated.*?<!-- End", "", (DOCS / name).read_text(), flags=re.DOTALL)
+        assert set(re.findall(r"^\|.*\|$", text, flags=re.MULTILINE)[:1]) <= {"| Column | Meaning |"}, name
 
 
 @pytest.mark.parametrize("folder", ["tasks", "algorithms"])

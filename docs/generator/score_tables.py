@@ -16,39 +16,15 @@ _SUITE = re.compile(r"MS\d+")
 """Ids of the arms that trained all tasks; `@best` follows for the best policy."""
 
 
-def best() -> str:
-    """For each task the algorithm with the highest score, next to what others have published."""
-    titles = ("Task", "Algorithm", ">Score", ">Std", ">Seeds", ">Steps (M)", ">Minutes")
-    titles += (">Highest published (v5)", ">Highest published (v4)", "Command")
-    rows = [
-        (
-            *(row["task"], row["algorithm"], number(row["score"]), number(row["std"]), row["seeds"]),
-            *(row["million_steps"], _minutes(row["alone_seconds"])),
-            *(number(highest_published(row["task"].replace("v5", version))) for version in ("v5", "v4")),
-            code(row["command"]),
-        )
-        for row in _best_rows()
-    ]
-    return table(titles, rows)
+def highest_published(task: str, several_seeds: bool = True) -> dict[str, str] | None:
+    """The row of published.csv with the highest score, or None.
 
-
-def _best_rows() -> list[dict[str, str]]:
-    """For each task the row of results.csv with the highest score."""
-    found: dict[str, dict[str, str]] = {}
-    for row in read("results.csv"):
-        if float(row["score"]) > float(found.get(row["task"], row | {"score": "-inf"})["score"]):
-            found[row["task"]] = row
-    return list(found.values())
-
-
-def _minutes(seconds: str) -> str:
-    return f"{float(seconds) / 60:.1f}" if seconds else "not measured"
-
-
-def highest_published(task: str) -> str:
-    """The highest mean over several seeds in published.csv."""
-    scores = [row["score"] for row in read("published.csv") if row["task"] == task and int(row["seeds"]) > 1]
-    return max(scores, key=float)
+    Args:
+        task: with its version.
+        several_seeds: whether to compare means over several seeds, or single runs.
+    """
+    rows = [row for row in read("published.csv") if row["task"] == task and (int(row["seeds"]) > 1) == several_seeds]
+    return max(rows, key=lambda row: float(row["score"]), default=None)
 
 
 def published(several_seeds: bool) -> str:
@@ -122,20 +98,18 @@ def suite() -> str:
         ">Random actions",
         ">SLM-Lab",
     )
-    return f"{table(titles, rows)}\n\n{_normalized(arms)}"
+    heading = 'Scores over all tasks, with 0 for random actions and 1 for "SLM-Lab":'
+    return f"{table(titles, rows)}\n\n{heading}\n\n{_normalized(arms)}"
 
 
 def _normalized(arms: dict[str, dict[str, str]]) -> str:
     """The normalized scores over all tasks of the final and of the best policies."""
-    means = []
-    for suffix in ("", "@best"):
+    lines = []
+    for policies, suffix in (("final", ""), ("best", "@best")):
         rows = [row for name, row in arms.items() if _SUITE.fullmatch(name.removesuffix(suffix)) and suffix in name]
         scores = [normalize(f"{row['task']}-{row['version']}", float(row["final_mean"])) for row in rows]
-        means += [f"{np.mean(scores):.2f}", f"{scipy.stats.trim_mean(scores, 0.25):.2f}"]
-    return (
-        'With 0 for random actions and 1 for "SLM-Lab", the final policies have '
-        f"a mean of {means[0]} and an interquartile mean of {means[1]}, the best ones {means[2]} and {means[3]}."
-    )
+        lines.append([policies, f"{np.mean(scores):.2f}", f"{scipy.stats.trim_mean(scores, 0.25):.2f}"])
+    return table(("Policies", ">Mean", ">Interquartile mean"), lines)
 
 
 def read(name: str) -> list[dict[str, str]]:

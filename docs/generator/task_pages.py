@@ -34,7 +34,7 @@ def page(name: str) -> str:
         _episodes(task, text),
         "## Options",
         _options(name),
-        "## What differs in v4",
+        "## Differences of v4",
         _differences(tasks, text),
     ]
     source = type(task).__module__.rpartition(".")[2]

@@ -1,0 +1,129 @@
+"""Tables of the best recipe of each task, and of what others have published on it."""
+
+import re
+from typing import NamedTuple
+
+from generator.markdown import code, table
+from generator.score_tables import highest_published, number, read
+from mjx_walk.experiments.suite import REFERENCES
+
+_ONE_SEED = {
+    "MS": ("csac", "4 or 5 other runs"),
+    "PT": ("PPO", "1 other run"),
+}
+"""Arms of one seed on every task, by the letters of their ids: the algorithm, and what else the GPU trains."""
+_DASH = "–"
+
+
+class Best(NamedTuple):
+    """The final policies of a task's best recipe for a GPU."""
+
+    task: str
+    algorithm: str
+    score: str
+    std_over_seeds: str
+    std_over_episodes: str
+    """Of a single seed."""
+    seeds: str
+    million_steps: str
+    seconds: str
+    """Training time, of all seeds of a process."""
+    shared_with: str
+    """What else trains on the GPU at the same time."""
+    command: str
+
+
+def best_recipes() -> list[Best]:
+    """For each task the recipe with the highest score.
+
+    Recipes with several seeds count before those with one. At equal scores, the shorter training counts.
+    """
+    several: dict[str, list[Best]] = {}
+    for row in read("results.csv"):
+        if row["policy"] == "final":
+            several.setdefault(row["task"], []).append(_of_several_seeds(row))
+    one: dict[str, list[Best]] = {}
+    for row in read("experiments.csv"):
+        if re.fullmatch(rf"({'|'.join(_ONE_SEED)})\d+", row["id"]):
+            one.setdefault(f"{row['task']}-{row['version']}", []).append(_of_one_seed(row))
+    found = [several.get(task) or one[task] for task in REFERENCES]
+    return [max(rows, key=lambda row: (float(row.score), -float(row.seconds))) for rows in found]
+
+
+def _of_several_seeds(row: dict[str, str]) -> Best:
+    others = int(row["seeds_per_process"]) - 1
+    alone = row["alone_seconds"]
+    return Best(
+        task=row["task"],
+        algorithm=row["algorithm"],
+        score=row["score"],
+        std_over_seeds=row["std"],
+        std_over_episodes="",
+        seeds=row["seeds"],
+        million_steps=row["million_steps"],
+        seconds=alone or row["seconds"],
+        shared_with=_DASH if alone else f"{others} other seeds",
+        command=row["command"],
+    )
+
+
+def _of_one_seed(row: dict[str, str]) -> Best:
+    algorithm, shared_with = _ONE_SEED[row["id"][:2]]
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", row["task"]).lower()
+    return Best(
+        task=f"{row['task']}-{row['version']}",
+        algorithm=algorithm,
+        score=row["final_mean"],
+        std_over_seeds="",
+        std_over_episodes=row["std"],
+        seeds="one seed",
+        million_steps=f"{int(row['steps']) / 1e6:.1f}",
+        seconds=row["seconds"],
+        shared_with=shared_with,
+        command=f"env={name} algo={algorithm.lower()}",
+    )
+
+
+def summary() -> str:
+    """The table of README: scores, times, and the highest published scores."""
+    rows = []
+    for best in best_recipes():
+        cells = [best.task, best.algorithm, number(best.score), number(best.std_over_seeds), best.seeds]
+        others = [_published(best.task, version, seeds) for version, seeds in _OTHERS]
+        rows.append([*cells, best.million_steps, f"{float(best.seconds) / 60:.1f}", *others, code(best.command)])
+    titles = ("Task", "Algorithm", ">Score", ">Std", ">Seeds", ">Steps (M)", ">Minutes")
+    return table((*titles, ">Highest mean (v5)", ">Highest single run (v5)", ">Highest mean (v4)", "Command"), rows)
+
+
+def detailed() -> str:
+    """The same recipes with the spread of their scores and the load of the GPU."""
+    rows = []
+    for best in best_recipes():
+        cells = [best.task, best.algorithm, number(best.score)]
+        cells += [number(best.std_over_seeds), number(best.std_over_episodes), best.seeds, best.million_steps]
+        rows.append([*cells, number(best.seconds), best.shared_with, code(best.command)])
+    titles = ("Task", "Algorithm", ">Score", ">Std over seeds", ">Std over episodes", ">Seeds", ">Steps (M)")
+    return table((*titles, ">Training (s)", "GPU shared with", "Command"), rows)
+
+
+def comparison() -> str:
+    """Scores and steps of the best recipes next to the highest published ones."""
+    rows = []
+    for best in best_recipes():
+        cells = [best.task.removesuffix("-v5"), number(best.score), best.seeds, best.million_steps]
+        for version, several_seeds in _OTHERS:
+            row = highest_published(best.task.replace("v5", version), several_seeds)
+            cells += [number(row["score"]), row["million_steps"]] if row else [_DASH, _DASH]
+        rows.append(cells)
+    titles = ("Task", ">Score (v5)", ">Seeds", ">Steps (M)", ">Highest mean (v5)", ">Steps (M)")
+    titles += (">Highest single run (v5)", ">Steps (M)", ">Highest mean (v4)", ">Steps (M)")
+    return table(titles, rows)
+
+
+_OTHERS = (("v5", True), ("v5", False), ("v4", True))
+"""Published scores to show: the version, and whether they are means over several seeds."""
+
+
+def _published(task: str, version: str, several_seeds: bool) -> str:
+    row = highest_published(task.replace("v5", version), several_seeds)
+    return number(row["score"]) if row else _DASH
