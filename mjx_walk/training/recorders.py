@@ -53,7 +53,7 @@ class Recorders:
         self._folders = folders
         self._processes = processes
 
-    def restore(self) -> list[tuple[TrainState, dict[str, Any]]]:
+    def restore(self) -> list[tuple[TrainState, Metadata]]:
         """The newest saved state and its metadata of each run, all at the same step; none if nothing is saved.
 
         Raises:
@@ -154,7 +154,7 @@ def have_saved(folders: list[RunFolder]) -> bool:
     raise _different_steps(int(own[-1].name) if own else 0 for own in saved)
 
 
-def restore_together(recorders: Sequence[Recorder], like: TrainState) -> list[tuple[TrainState, dict[str, Any]]]:
+def restore_together(recorders: Sequence[Recorder], like: TrainState) -> list[tuple[TrainState, Metadata]]:
     """The newest saved state and its metadata of each run, all at the same step.
 
     Args:

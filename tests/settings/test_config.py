@@ -21,9 +21,8 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import describe, has_effect
 
 RECIPES = [f"{size}/{env}_{algo}" for size in HARDWARE for env in TASKS for algo in ALGORITHMS]
-FILES = sorted(
-    str(path.relative_to(f"{CONFIG_DIR}/recipe"))[:-5] for path in Path(CONFIG_DIR).glob("recipe/*/[!_]*.yaml")
-)
+FOLDER = Path(CONFIG_DIR) / "recipe"
+FILES = sorted(str(path.relative_to(FOLDER).with_suffix("")) for path in FOLDER.glob("*/[!_]*.yaml"))
 
 LONGER_SCHEDULES = {"cpu/humanoid_ppo": 3_000_000}
 """Of the recipes that end before their schedule. All others anneal to the end."""
