@@ -16,6 +16,7 @@ from mjx_walk.envs import Task
 from mjx_walk.logs.metrics import Row
 from mjx_walk.settings.config import Config
 from mjx_walk.storage.checkpoint import list_steps, read_meta
+from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.distributed_checkpoint import SEEDS_TOGETHER
