@@ -9,7 +9,6 @@ if __name__ != "mjx_walk.envs":  # a second import under another name would dupl
 
 import dataclasses
 import difflib
-from pathlib import Path
 from typing import Any
 
 from mjx_walk.envs.registry import BUILT_IN_TASKS, TASKS, register_task
@@ -18,6 +17,7 @@ from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions, with_absolute_paths
 from mjx_walk.envs.view import View
 from mjx_walk.machine.compat import prepare_jax
+from mjx_walk.storage.files import working_folder
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.near_misses import unknown
 from mjx_walk.utils.setting_fields import validate
@@ -72,4 +72,4 @@ def make_options(name: str, **kwargs: Any) -> TaskOptions:
             raise UserError(f"{name} has no option '{option}'; {hint}")
     options = options_class(**kwargs)
     validate(options)
-    return with_absolute_paths(options, Path.cwd())
+    return with_absolute_paths(options, working_folder())

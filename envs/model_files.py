@@ -21,6 +21,7 @@ _TAG = re.compile(r"""<!--.*?-->|<!\[CDATA\[.*?\]\]>|<!.*?>|<([\w:.-]+)((?:[^<>"
 """A comment, text in CDATA or a declaration; or a tag and its attributes."""
 _FILE = re.compile("file(name|right|left|up|down|front|back)?")
 """Attributes that name a file."""
+_REFERENCE = re.compile(r"&(?:#\d+|#x[0-9a-fA-F]+|amp|lt|gt|quot|apos);")
 _FOLDERS = {"mesh": "meshdir", "flexcomp": "meshdir", "texture": "texturedir"}
 """The compiler's attribute for the folder of an element's file."""
 
@@ -130,7 +131,7 @@ def _read_tags(
     text = (root / name).read_bytes().decode("utf-8", "surrogateescape")
     for tag, content in _TAG.findall(text):  # with comments and text, whose tag is empty
         attributes = {
-            key: html.unescape(double or single).replace("\\", "/")  # MuJoCo takes both for a separator
+            key: _unescape(double or single).replace("\\", "/")  # MuJoCo takes both for a separator
             for key, double, single in _ATTRIBUTE.findall(content)
         }
         tags.append((place, tag, attributes))
@@ -138,6 +139,11 @@ def _read_tags(
             source = _first_file(root, (folder, place), attributes["file"])
             if source and source not in found:
                 _read_tags(root, folder, source, tags, found)
+
+
+def _unescape(text: str) -> str:
+    """Text without XML's references. Python's `html` knows more names than XML has."""
+    return _REFERENCE.sub(lambda found: html.unescape(found[0]), text)
 
 
 def _first_file(root: Path, folders: Iterable[str], name: str) -> str | None:

@@ -108,7 +108,7 @@ def load_with_sources(xml_file: str) -> tuple[mujoco.MjModel, dict[str, str]]:
 
 
 def warn_of_changed_sources(xml_file: str, sources: dict[str, str]) -> None:
-    """Log a warning if Gymnasium, which reads a model's files again, reads another model.
+    """Log a warning if who reads a model's files again, such as Gymnasium or a copy, reads another model.
 
     Args:
         xml_file: name of one of Gymnasium's assets, or a path.
@@ -122,7 +122,7 @@ def warn_of_changed_sources(xml_file: str, sources: dict[str, str]) -> None:
         raise UserError(f"model file {path} is gone, and Gymnasium reads it again; restore it")
     changed = changed_names(sources, source_hashes(xml_file))
     if changed:
-        _LOGGER.warning("%s has changed since it was loaded; Gymnasium plays it as it is now", path.parent / changed[0])
+        _LOGGER.warning("%s has changed since it was loaded; it is used as it is now", path.parent / changed[0])
 
 
 def _not_found(xml_file: str, path: Path) -> str:

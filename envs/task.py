@@ -1,7 +1,6 @@
 """What all Gymnasium tasks share: model, engine, resets, finiteness check, time limit."""
 
 import abc
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +20,7 @@ from mjx_walk.envs.task_options import TaskOptions, check_version, with_absolute
 from mjx_walk.envs.user_files import load_reward_function
 from mjx_walk.envs.view import View
 from mjx_walk.machine.compat import standard_dtypes
+from mjx_walk.storage.files import working_folder
 
 __all__ = ["Task"]
 
@@ -69,7 +69,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
                 reads or has what the engine does not simulate.
         """
         check_version(options, self.XML_FILES, self.MISSING_VERSIONS, {"v5": self.V5_ONLY, "v4": self.V4_ONLY})
-        self.options = options = with_absolute_paths(options, Path.cwd())
+        self.options = options = with_absolute_paths(options, working_folder())
         self.max_episode_steps = options.max_episode_steps
         self.model_file = options.xml_file or self.XML_FILES[options.version]
         self.model, self.model_sources = models.load_with_sources(self.model_file)

@@ -8,11 +8,12 @@ import importlib.util
 import itertools
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from mjx_walk.envs.imported_files import INSTALLED, NEVER_HELPERS, imported_files
 from mjx_walk.storage.files import user_path
 from mjx_walk.utils.errors import UserError
 
@@ -29,8 +30,6 @@ __all__ = [
 _NUMBERS = itertools.count()
 _PREFIX = "_mjx_walk_user_file_"
 """Start of the names in `sys.modules` of the user's files themselves."""
-_NEVER_HELPERS = sys.stdlib_module_names | {"mjx_walk"}
-_INSTALLED = ("site-packages", "dist-packages")
 
 _known: dict[Path, Mapping[str, str]] = {}
 """The SHA-256 of all files that a user's file may run, by the path of that file. Others may run any."""
@@ -141,7 +140,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def __enter__(self) -> None:
         names = {path.stem for path in self._folder.glob("*.py")}
         names |= {path.parent.name for path in self._folder.glob("*/__init__.py")}
-        names -= _NEVER_HELPERS
+        names -= NEVER_HELPERS
         same = {name: module for name, module in sys.modules.items() if name.partition(".")[0] in names}
         self._hidden = {name: module for name, module in same.items() if self._is_another_users(module)}
         for name in self._hidden:
@@ -158,7 +157,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def _is_another_users(self, module: ModuleType) -> bool:
         """Whether a module is neither of this folder nor installed."""
         file = Path(getattr(module, "__file__", None) or "")
-        return not (file.is_relative_to(self._folder) or {*_INSTALLED} & {*file.parts})
+        return not (file.is_relative_to(self._folder) or {*INSTALLED} & {*file.parts})
 
     def spec(self, name: str, path: Path) -> importlib.machinery.ModuleSpec:
         """A module's spec."""
@@ -172,7 +171,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     ) -> importlib.machinery.ModuleSpec | None:
         """The spec of a helper. None for the standard library, this package, and what is not in the folder."""
         top, dot, _ = name.partition(".")
-        if top in _NEVER_HELPERS or (dot and top not in self._tops):
+        if top in NEVER_HELPERS or (dot and top not in self._tops):
             return None
         place = self._folder.joinpath(*name.split("."))
         for file in (place / "__init__.py", place.with_name(f"{place.name}.py")):
@@ -193,49 +192,18 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         if self._known is not None and self._known.get(file) != found:
             raise UserError(f"{file} is new or has changed since you named it; to run it, add this to the command line")
         self.hashes[file] = found
-        self._hash_imports(Path(file), source)
         exec(compile(source, file, "exec", dont_inherit=True), vars(module))
+        self._hash_imports(Path(file), source)  # not before, since it may extend sys.path
         if not module.__name__.startswith(_PREFIX):
             self._loaded[module.__name__] = module
 
     def _hash_imports(self, file: Path, source: bytes) -> None:
         """Hash the helpers that a file imports anywhere, and theirs."""
-        for helper in _imported_files(file, source, self._folder):
+        for helper in imported_files(file, source, self._folder):
             if str(helper) not in self.hashes:
                 content = helper.read_bytes()
                 self.hashes[str(helper)] = hashlib.sha256(content).hexdigest()
                 self._hash_imports(helper, content)
-
-
-def _imported_files(file: Path, source: bytes, folder: Path) -> Iterator[Path]:
-    """Files in a folder that a Python file imports. It is read and not run."""
-    try:
-        nodes = list(ast.walk(ast.parse(source)))
-    except (SyntaxError, ValueError, RecursionError):
-        return  # running it reports it
-    for node in nodes:
-        start = folder
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            start = file.parents[node.level - 1] if node.level else folder
-            names = [".".join(filter(None, (node.module, alias.name))) for alias in node.names]
-        else:
-            continue
-        for name in names:
-            if start != folder or name.partition(".")[0] not in _NEVER_HELPERS:
-                yield from _files_of(start, name)
-
-
-def _files_of(folder: Path, name: str) -> Iterator[Path]:
-    """Files that run when a module of a folder is imported: its packages, and its own."""
-    place = folder
-    for part in name.split("."):
-        place /= part
-        found = next((path for path in (place / "__init__.py", place.with_name(f"{part}.py")) if path.is_file()), None)
-        if found is None:
-            return
-        yield found
 
 
 def load_reward_function(source: str) -> UserFile:

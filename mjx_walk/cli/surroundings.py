@@ -4,11 +4,11 @@ import errno
 import os
 import sys
 
+from mjx_walk.storage.files import NO_WORKING_FOLDER
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["check_surroundings", "correctable"]
 
-_NO_FOLDER = "the working folder was deleted; change to another one, for example with cd ~"
 _DISK_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
     *(errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP),
@@ -25,7 +25,7 @@ def check_surroundings(arguments: list[str]) -> None:
     try:
         here = os.getcwd()
     except FileNotFoundError:
-        raise UserError(_NO_FOLDER) from None
+        raise UserError(NO_WORKING_FOLDER) from None
     encoding = sys.getfilesystemencoding()
     for name, text in (("the working folder", here), *(("the argument", argument) for argument in arguments)):
         if not _is_text(text) and (encoding != "utf-8" or text == here):
@@ -52,5 +52,5 @@ def correctable(error: OSError) -> str | None:
     try:
         os.getcwd()
     except FileNotFoundError:
-        return _NO_FOLDER
+        return NO_WORKING_FOLDER
     return None

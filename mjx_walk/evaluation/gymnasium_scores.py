@@ -58,7 +58,7 @@ def score_in_gymnasium(task: Task, act: Act, num_episodes: int, seed: int = 0) -
     if not task.is_in_gymnasium:
         return score_in_sim(task, compile_episodes(task, lambda obs, key: act(obs)), num_episodes, seed)
     warn_of_changed_sources(task.model_file, task.model_sources)
-    seeds = [seed + i for i in range(num_episodes)]
+    seeds = [int(seed) + i for i in range(num_episodes)]  # Gymnasium refuses NumPy's integers
     rounds = [seeds[i : i + _MAX_PARALLEL_EPISODES] for i in range(0, num_episodes, _MAX_PARALLEL_EPISODES)]
     with contextlib.closing(ScoringProgress(num_episodes, len(rounds) * task.max_episode_steps)) as progress:
         played = [_play_in_gymnasium(task, act, some, progress, number) for number, some in enumerate(rounds)]

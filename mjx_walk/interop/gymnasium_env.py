@@ -12,6 +12,7 @@ import numpy as np
 
 from mjx_walk.envs import NO_TIME_LIMIT, State, make_options
 from mjx_walk.envs.model_changes import ModelSnapshot
+from mjx_walk.envs.models import warn_of_changed_sources
 from mjx_walk.envs.state import check_action_shape
 from mjx_walk.interop.gymnasium_info import single_info
 from mjx_walk.interop.gymnasium_programs import is_forked, make_programs, refuse_fork
@@ -113,10 +114,11 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
 
     def __getstate__(self) -> dict[str, object]:
         state = {name: jax.device_get(value) for name, value in vars(self).items() if name not in _NOT_PICKLED}
-        return state | {"_init": (self.init_qpos, self.init_qvel)}
+        return state | {"_init": (self.init_qpos, self.init_qvel), "_sources": self._programs.task.model_sources}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        init = state.pop("_init")
+        init, sources = state.pop("_init"), state.pop("_sources")
         vars(self).update(state)
         self._build()
+        warn_of_changed_sources(self._programs.task.model_file, sources)
         self.init_qpos, self.init_qvel = init

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from mjx_walk.envs import NO_TIME_LIMIT, State, make_options
 from mjx_walk.envs.info import Info
 from mjx_walk.envs.model_changes import ModelSnapshot
+from mjx_walk.envs.models import warn_of_changed_sources
 from mjx_walk.envs.state import check_action_shape
 from mjx_walk.interop.gymnasium_info import add_flags, add_info
 from mjx_walk.interop.gymnasium_programs import make_programs, refuse_fork
@@ -59,6 +60,9 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         refuse_fork()
         if type_problem(num_envs, int) or num_envs < 1:
             raise UserError(f"num_envs={num_envs}: must be an integer of at least 1")
+        prng = jax.config.values["jax_default_prng_impl"]
+        if prng != "threefry2x32":  # NumPy draws keys of its shape
+            raise UserError(f"JAX_DEFAULT_PRNG_IMPL={prng}: make_vec needs threefry2x32; unset it")
         options, self._rendering = split_keywords(keywords)
         mode = self._rendering.get("render_mode")
         if mode == "human" or str(mode).endswith("_list"):
@@ -241,11 +245,14 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         self._keys, self._seeds = keys, tuple(known)
 
     def __getstate__(self) -> dict[str, object]:
-        return {name: jax.device_get(value) for name, value in vars(self).items() if name not in _NOT_PICKLED}
+        state = {name: jax.device_get(value) for name, value in vars(self).items() if name not in _NOT_PICKLED}
+        return state | {"_sources": self._programs.task.model_sources}
 
-    def __setstate__(self, state: dict[str, object]) -> None:
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        sources = state.pop("_sources")
         vars(self).update(state)
         self._build()
+        warn_of_changed_sources(self._programs.task.model_file, sources)
 
 
 def _with_gymnasiums_limit(options: dict[str, object]) -> dict[str, object]:

@@ -17,7 +17,7 @@ from mjx_walk.settings.recipe_files import with_paths, with_stored_recipes
 from mjx_walk.settings.recipes import CONFIG_DIR, recipe_names
 from mjx_walk.settings.renamed import present_overrides
 from mjx_walk.settings.schema import CheckpointConfig, Config
-from mjx_walk.storage.files import user_path
+from mjx_walk.storage.files import user_path, working_folder
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import has_effect, refuse_ineffective, validate
 
@@ -65,7 +65,7 @@ def compose_config(overrides: list[str]) -> Config:
     try:
         with own_hydra() as store, initialize_config_dir(CONFIG_DIR, version_base="1.3"):
             config = to_config(compose("train", with_stored_recipes(overrides, store)))
-        return with_absolute_paths(config, Path.cwd())
+        return with_absolute_paths(config, working_folder())
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(with_paths(explain(error, overrides))) from error
 

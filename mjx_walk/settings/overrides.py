@@ -53,6 +53,8 @@ def complete_overrides(overrides: list[str], is_sweep: bool = False) -> list[str
             text = str(override.input_line)
             value = text.partition("=")[2] or "VALUE"
             raise UserError(f"'{text}': keys cannot be added or removed; write {key}={value}")
+        if key in ("hardware", "recipe") and not override.is_sweep_override() and not isinstance(override.value(), str):
+            raise UserError(f"{override.input_line}: give one name, or leave {key}= out")
         known: Collection[str] | None = {"env": TASKS.keys(), "algo": ALGORITHMS.keys()}.get(key)
         for value in _values(override) if known else ():
             if known and value not in known:

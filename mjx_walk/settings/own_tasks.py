@@ -11,6 +11,7 @@ from mjx_walk.envs.registry import (
 )
 from mjx_walk.envs.user_files import absolute_source, only_known, source_path
 from mjx_walk.settings.trust import remember, require_trusted
+from mjx_walk.storage.files import working_folder
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["KEY", "find_saved_task", "name_task", "take_task"]
@@ -31,7 +32,7 @@ def name_task(source: str) -> tuple[str, str]:
     Raises:
         UserError: the file or the class is missing or invalid, or the name is taken.
     """
-    source = absolute_source(source, Path.cwd())
+    source = absolute_source(source, working_folder())
     only_known(source_path(source), None)
     name = register_task_file(source)
     remember(source, task_hashes(name), KEY)

@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.settings.recipes import CONFIG_DIR, HARDWARE, fallback, has_file
-from mjx_walk.storage.files import read_bytes, user_path
+from mjx_walk.storage.files import read_bytes, user_path, working_folder
 from mjx_walk.utils.errors import UserError, first_line
 
 __all__ = ["read_recipe", "recipe_file", "recipe_settings", "with_paths", "with_stored_recipes"]
@@ -42,7 +42,7 @@ def recipe_file(name: str, folder: Path | None = None) -> Path | None:
     """
     if _is_shipped(name):
         return None
-    path = Path(os.path.abspath((folder or Path.cwd()) / user_path(name)))
+    path = Path(os.path.abspath((folder or working_folder()) / user_path(name)))
     for file in (path, path.with_name(f"{path.name}.yaml")):
         if file.is_file():
             return file

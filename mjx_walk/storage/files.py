@@ -15,6 +15,7 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.text import has_controls
 
 __all__ = [
+    "NO_WORKING_FOLDER",
     "Appender",
     "check_replaceable",
     "fresh_name",
@@ -29,8 +30,23 @@ __all__ = [
     "sync_tree",
     "user_folder",
     "user_path",
+    "working_folder",
     "write_text",
 ]
+
+NO_WORKING_FOLDER = "the working folder was deleted; change to another one, for example with cd ~"
+
+
+def working_folder() -> Path:
+    """The working folder.
+
+    Raises:
+        UserError: it was deleted.
+    """
+    try:
+        return Path.cwd()
+    except FileNotFoundError:
+        raise UserError(NO_WORKING_FOLDER) from None
 
 
 def user_path(path: str | Path) -> Path:
@@ -45,7 +61,7 @@ def user_path(path: str | Path) -> Path:
     if not text:
         raise UserError("a path is empty; write the name of a file or folder")
     if not text.startswith("~"):
-        return Path.cwd() / text if str(Path(text)).startswith("~") else Path(text)
+        return working_folder() / text if str(Path(text)).startswith("~") else Path(text)
     try:
         return Path(text).expanduser()
     except RuntimeError as error:

@@ -102,6 +102,10 @@ ODD = {
         f'<mujoco model="<!--"><include file="b.xml"/>{BODY}<!-- --></mujoco>',
         {"b.xml": '<mujoco><asset><mesh name="m" file="m.obj"/></asset></mujoco>', "m.obj": TETRAHEDRON},
     ),
+    "references": (
+        f'<mujoco><include file="a&amp;b&#x63;.xml"/>{BODY}</mujoco>',
+        {"a&bc.xml": '<mujoco><asset><mesh name="m" file="m&copy.obj"/></asset></mujoco>', "m&copy.obj": TETRAHEDRON},
+    ),
     "text and declarations": (
         '<mujoco><!ELEMENT <include file="x.xml"/>><![CDATA[<include file="x.xml"/>]]><include file="b.xml"/>'
         f"{BODY}</mujoco>",
@@ -191,7 +195,7 @@ def test_gymnasium_that_reads_another_model_than_the_task_is_reported(tmp_path, 
     assert not caplog.records
     path.write_text(path.read_text().replace("-9.81", "-9"))
     make_gymnasium(task).close()
-    assert f"{path} has changed since it was loaded; Gymnasium plays it as it is now" in caplog.text
+    assert f"{path} has changed since it was loaded; it is used as it is now" in caplog.text
     path.unlink()
     for reads_it in (make_gymnasium, lambda task: score_in_gymnasium(task, lambda obs: obs[:, :1], 1)):
         with pytest.raises(UserError, match="is gone, and Gymnasium reads it again; restore it"):

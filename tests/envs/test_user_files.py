@@ -150,6 +150,26 @@ def test_helpers_that_run_later_are_hashed(tmp_path, clean):
     assert changed_file(file.hashes) == str(tmp_path / "my_late.py")
 
 
+def test_helpers_elsewhere_are_hashed(tmp_path, clean, monkeypatch):
+    """Folders without `__init__.py` on `sys.path`, and a folder that the file adds to it."""
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    source = (
+        f"import sys, numpy, json\nsys.path.insert(0, '{tmp_path}/shared')\nimport my_other, my_space.deep\n"
+        "def reward(step):\n    from my_space import late\n"
+    )
+    files = {"r.py": source, "my_space/deep.py": "", "my_space/late.py": "", "shared/my_other.py": ""}
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    try:
+        hashes = load_reward_function(f"{tmp_path}/r.py:reward").hashes
+    finally:
+        sys.path.remove(f"{tmp_path}/shared")
+        for name in ("my_other", "my_space", "my_space.deep"):
+            sys.modules.pop(name, None)
+    assert sorted(hashes) == sorted(str(tmp_path / name) for name in files)
+
+
 def test_a_new_helper_is_not_known(tmp_path, clean):
     """It would run in place of a module that the reward file has imported from elsewhere."""
     (tmp_path / "r.py").write_text("import colorama_or_so\n\n\ndef reward(step):\n    return 1\n")

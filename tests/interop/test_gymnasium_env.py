@@ -16,6 +16,7 @@ from helpers import ENVIRONMENT, renders
 from side_by_side import IDS, REGISTERED, assert_same, make_both, outcome
 
 from mjx_walk.envs import TASKS, make_env
+from mjx_walk.envs.model_files import ASSETS
 from mjx_walk.interop import gymnasium_programs
 from mjx_walk.utils.errors import UserError
 
@@ -253,3 +254,17 @@ def test_a_forked_process_is_told_to_spawn(monkeypatch):
     assert env.observation_space.shape == (17,)
     with pytest.raises(gymnasium.error.Error, match=r"vector_kwargs={'context': 'spawn'}"):
         env.reset()
+
+
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_a_copy_warns_if_the_model_file_has_changed(num_envs, tmp_path, caplog):
+    path = tmp_path / "mine.xml"
+    path.write_bytes((ASSETS / "inverted_pendulum.xml").read_bytes())
+    settings = {"physics": "c", "xml_file": str(path)}
+    name = "mjx_walk/InvertedPendulum-v5"
+    env = gymnasium.make_vec(name, num_envs, **settings) if num_envs else gymnasium.make(name, **settings)
+    copy.deepcopy(env)
+    assert not caplog.text
+    path.write_text(path.read_text().replace('gear="100"', 'gear="50"'))
+    copy.deepcopy(env)
+    assert f"{path} has changed since it was loaded; it is used as it is now" in caplog.text
