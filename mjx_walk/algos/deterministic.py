@@ -99,20 +99,20 @@ class DeterministicAlgorithm(OffPolicyAlgorithm[DeterministicState, _Determinist
         )
 
     def deterministic_action(
-        self, params: Params, obs: Float[Array, "B observation_size"]
-    ) -> Float[Array, "B action_size"]:
+        self, params: Params, obs: Float[Array, "*B observation_size"]
+    ) -> Float[Array, "*B action_size"]:
         """The action of the policy."""
         return jnp.tanh(self.policy_network.apply(None, params, obs))
 
     def explore(
-        self, params: Params, obs: Float[Array, "B observation_size"], key: PRNGKeyArray
-    ) -> Float[Array, "B action_size"]:
+        self, params: Params, obs: Float[Array, "*B observation_size"], key: PRNGKeyArray
+    ) -> Float[Array, "*B action_size"]:
         action = self.deterministic_action(params, obs)
         return jnp.clip(action + self.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
 
     def act(
-        self, params: Params, obs: Float[Array, "B observation_size"], key: PRNGKeyArray, deterministic: bool
-    ) -> Float[Array, "B action_size"]:
+        self, params: Params, obs: Float[Array, "*B observation_size"], key: PRNGKeyArray, deterministic: bool
+    ) -> Float[Array, "*B action_size"]:
         return self.deterministic_action(params, obs) if deterministic else self.explore(params, obs, key)
 
     def critic_target(self, learner: DeterministicState, batch: Batch, key: PRNGKeyArray) -> Float[Array, " N"]:

@@ -73,14 +73,14 @@ class OffPolicyAlgorithm(
 
     @abc.abstractmethod
     def act(
-        self, params: Params, obs: Float[Array, "B observation_size"], key: PRNGKeyArray, deterministic: bool
-    ) -> Float[Array, "B action_size"]:
+        self, params: Params, obs: Float[Array, "*B observation_size"], key: PRNGKeyArray, deterministic: bool
+    ) -> Float[Array, "*B action_size"]:
         """Actions of the policy."""
 
     @abc.abstractmethod
     def explore(
-        self, params: Params, obs: Float[Array, "B observation_size"], key: PRNGKeyArray
-    ) -> Float[Array, "B action_size"]:
+        self, params: Params, obs: Float[Array, "*B observation_size"], key: PRNGKeyArray
+    ) -> Float[Array, "*B action_size"]:
         """Actions of the policy with exploration noise."""
 
     @abc.abstractmethod
@@ -129,7 +129,7 @@ class OffPolicyAlgorithm(
     def policy(self, policy_params: PolicyParams, deterministic: bool = True) -> PolicyFn:
         normalizer, params = policy_params
 
-        def act(obs: Float[Array, "B observation_size"], key: PRNGKeyArray) -> Float[Array, "B action_size"]:
+        def act(obs: Float[Array, "*B observation_size"], key: PRNGKeyArray) -> Float[Array, "*B action_size"]:
             action = self.act(params, self.normalize(normalizer, obs), key, deterministic)
             return self.task.scale_action(action)
 

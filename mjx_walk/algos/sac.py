@@ -92,15 +92,15 @@ class SAC(OffPolicyAlgorithm[SACState, SACConfig]):
         )
 
     def act(
-        self, params: Params, obs: Float[Array, "B observation_size"], key: PRNGKeyArray, deterministic: bool
-    ) -> Float[Array, "B action_size"]:
+        self, params: Params, obs: Float[Array, "*B observation_size"], key: PRNGKeyArray, deterministic: bool
+    ) -> Float[Array, "*B action_size"]:
         logits = self.nets.policy_network.apply(None, params, obs)
         distribution = self.nets.parametric_action_distribution
         return distribution.mode(logits) if deterministic else distribution.sample(logits, key)
 
     def explore(
-        self, params: Params, obs: Float[Array, "B observation_size"], key: PRNGKeyArray
-    ) -> Float[Array, "B action_size"]:
+        self, params: Params, obs: Float[Array, "*B observation_size"], key: PRNGKeyArray
+    ) -> Float[Array, "*B action_size"]:
         return self.act(params, obs, key, deterministic=False)
 
     def losses(self, batch: Batch) -> SACLosses:
