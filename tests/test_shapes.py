@@ -21,11 +21,13 @@ def load(path, text):
     return module
 
 
-def test_an_argument_of_another_shape_or_dtype_is_refused():
-    returns.n_step_return(REWARD, ENDED, 0.9)
+def test_an_argument_of_another_shape_or_dtype_is_refused(tmp_path):
+    with open(returns.__file__, encoding="utf-8") as file:
+        checked = load(tmp_path / "checked.py", file.read())
+    checked.n_step_return(REWARD, ENDED, 0.9)
     for reward, ended in ((REWARD[0], ENDED), (REWARD[:2], ENDED), (REWARD, jnp.float32(ENDED))):
         with pytest.raises(jaxtyping.TypeCheckError, match="n_step_return"):
-            returns.n_step_return(reward, ended, 0.9)
+            checked.n_step_return(reward, ended, 0.9)
 
 
 @pytest.mark.parametrize(
