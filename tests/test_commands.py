@@ -24,7 +24,7 @@ def call(monkeypatch, *arguments):
 
 
 def test_the_list_has_every_command_with_its_example_and_what_it_does(monkeypatch, capsys):
-    paths = [path for path in (CLONE / "mjx_walk").rglob("*.py") if "cli.main(main)" in path.read_text()]
+    paths = [path for path in (CLONE / "mjx_walk").rglob("*.py") if "parsing.main(main)" in path.read_text()]
     names = [path.parent.name if path.stem == "__main__" else path.stem for path in paths]
     assert sorted(names) == sorted(commands.COMMANDS)
     assert call(monkeypatch) == 0
