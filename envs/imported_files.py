@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-__all__ = ["INSTALLED", "NEVER_HELPERS", "imported_files"]
+__all__ = ["INSTALLED", "NEVER_HELPERS", "imported_files", "module_file"]
 
 NEVER_HELPERS = sys.stdlib_module_names | {"mjx_walk"}
 """Top-level modules that are no helpers of a user, even if a file beside has such a name."""
@@ -30,9 +30,12 @@ def imported_files(file: Path, source: bytes, folder: Path) -> Iterator[Path]:
             names = [".".join(filter(None, (node.module, alias.name))) for alias in node.names]
         else:
             continue
+        is_relative = isinstance(node, ast.ImportFrom) and node.level > 0
         for name in names:
-            if start != folder or name.partition(".")[0] not in NEVER_HELPERS:
-                yield from list(_files_of(start, name)) or _files_on_path(name)
+            if is_relative:
+                yield from _files_of(start, name)
+            elif name.partition(".")[0] not in NEVER_HELPERS:
+                yield from list(_files_of(folder, name)) or _files_on_path(name)
 
 
 def _files_of(folder: Path, name: str) -> Iterator[Path]:
@@ -40,10 +43,16 @@ def _files_of(folder: Path, name: str) -> Iterator[Path]:
     place = folder
     for part in name.split("."):
         place /= part
-        found = next((path for path in (place / "__init__.py", place.with_name(f"{part}.py")) if path.is_file()), None)
+        found = module_file(place)
         if found is None:
             return
         yield found
+
+
+def module_file(place: Path) -> Path | None:
+    """The file of a module, given its path without an ending: a package's `__init__.py`, or `NAME.py`."""
+    files = (place / "__init__.py", place.with_name(f"{place.name}.py"))
+    return next((file for file in files if file.is_file()), None)
 
 
 def _files_on_path(name: str) -> Iterator[Path]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mjx_walk.envs.imported_files import INSTALLED, NEVER_HELPERS, imported_files
+from mjx_walk.envs.imported_files import INSTALLED, NEVER_HELPERS, imported_files, module_file
 from mjx_walk.storage.files import user_path
 from mjx_walk.utils.errors import UserError
 
@@ -173,12 +173,11 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         top, dot, _ = name.partition(".")
         if top in NEVER_HELPERS or (dot and top not in self._tops):
             return None
-        place = self._folder.joinpath(*name.split("."))
-        for file in (place / "__init__.py", place.with_name(f"{place.name}.py")):
-            if file.is_file():
-                self._tops.add(top)
-                return self.spec(name, file)
-        return None
+        file = module_file(self._folder.joinpath(*name.split(".")))
+        if file is None:
+            return None
+        self._tops.add(top)
+        return self.spec(name, file)
 
     def exec_module(self, module: ModuleType) -> None:
         """Run a module.
