@@ -12,7 +12,7 @@ from helpers import OPTIMIZED, command_here, slow_except
 from mjx_walk import parity as parity_command
 from mjx_walk.envs import TASKS, make_env
 from mjx_walk.envs.physics import PhysicsState, make_engine, mjx_warp
-from mjx_walk.evaluation import parity
+from mjx_walk.evaluation import engine_parity
 from mjx_walk.evaluation.random_steps import take_random_steps
 from mjx_walk.machine.compat import prepare_jax
 from mjx_walk.utils.errors import UserError
@@ -49,9 +49,9 @@ CASES = [
 @pytest.mark.parametrize(("name", "version", "physics"), CASES)
 def test_one_step_from_standing_airborne_thrown_and_fallen_states(name, version, physics):
     reference, task = (make_env(name, physics=engine, version=version) for engine in ("c", physics))
-    states, actions = jax.device_get(parity.reference_states(reference, num_envs=24, num_steps=70, seed=0))
+    states, actions = jax.device_get(engine_parity.reference_states(reference, num_envs=24, num_steps=70, seed=0))
     stepped = jax.jit(jax.vmap(task.step), compiler_options=OPTIMIZED)(states, actions)
-    found = parity.compare(task, parity.one_step(reference, states, actions), jax.device_get(stepped))
+    found = engine_parity.compare(task, engine_parity.one_step(reference, states, actions), jax.device_get(stepped))
     assert found.is_within, "\n".join(map(str, found.errors))
     assert found.num_steps >= 1600 and found.nonfinite == 0
     if task.terminates_on_fall:  # both sides of the healthy range were visited
@@ -123,10 +123,10 @@ def test_the_compiler_reduces_a_large_batch_right():
 def test_a_wrong_engine_is_noticed():
     reference = make_env("walker2d", physics="c")
     wrong = make_env("walker2d", physics="c", frame_skip=3)
-    states, actions = parity.reference_states(reference, 6, 5, seed=0)
-    expected = parity.one_step(reference, states, actions)
-    assert parity.compare(reference, expected, parity.one_step(reference, states, actions)).is_within
-    assert not parity.compare(reference, expected, parity.one_step(wrong, states, actions)).is_within
+    states, actions = engine_parity.reference_states(reference, 6, 5, seed=0)
+    expected = engine_parity.one_step(reference, states, actions)
+    assert engine_parity.compare(reference, expected, engine_parity.one_step(reference, states, actions)).is_within
+    assert not engine_parity.compare(reference, expected, engine_parity.one_step(wrong, states, actions)).is_within
 
 
 @pytest.mark.slow
