@@ -81,7 +81,7 @@ def load_model(xml_file: str) -> mujoco.MjModel:
 
 
 def _has_enough_memory(path: Path, model: mujoco.MjModel) -> bool:
-    """Whether the memory that a model file names, if any, suffices while every contact and every limit acts.
+    """Whether a model has the memory that MuJoCo chooses by default, or enough while every contact and limit acts.
 
     With less, MuJoCo leaves out constraints, or stops with an error in the middle of an episode.
     """
@@ -89,6 +89,10 @@ def _has_enough_memory(path: Path, model: mujoco.MjModel) -> bool:
         spec = mujoco.MjSpec.from_file(str(path))
     if all(size < 0 for size in (spec.memory, spec.nstack, spec.njmax, spec.nconmax)):  # MuJoCo chooses
         return True
+    spec.memory = spec.nstack = spec.njmax = spec.nconmax = -1
+    with hide_deprecations():
+        if model.narena >= spec.compile().narena:
+            return True
     worst = copy.deepcopy(model)
     for margin in (worst.geom_margin, worst.pair_margin, worst.jnt_margin, worst.tendon_margin):
         margin[:] = _EVERYWHERE

@@ -96,6 +96,15 @@ def test_memory_that_suffices_only_at_first_is_refused(tmp_path):
             load_model(str(path))
 
 
+def test_memory_that_mujoco_would_choose_is_enough(tmp_path):
+    """A hundred boxes that all touch each other would need more, as they do without a `<size>`."""
+    body = '<body><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>'
+    path = tmp_path / "boxes.xml"
+    for size in ("", '<size memory="57M"/>'):
+        path.write_text(f"<mujoco>{size}<worldbody>{body * 100}</worldbody></mujoco>")
+        assert load_model(str(path)).narena == 57 * 2**20
+
+
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     ("model", "name", "result"),
