@@ -1,4 +1,4 @@
-"""What the motors of a model act on: joints, tendons, sites or bodies."""
+"""Targets of a model's motors: joints, tendons, sites or bodies."""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,4 @@
-"""What Walker2d, Hopper and HalfCheetah share: a body that runs along x, in the plane of x and z."""
+"""Base of Walker2d, Hopper and HalfCheetah: a body that runs along x, in the plane of x and z."""
 
 import dataclasses
 

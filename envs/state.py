@@ -84,7 +84,7 @@ def is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[A
 
 @runtime_checkable
 class TrainableTask(Protocol):
-    """What a trainer needs of a task. All methods are pure functions of one unbatched environment."""
+    """A task as trainers see it. All methods are pure functions of one unbatched environment."""
 
     observation_size: int
     action_size: int

@@ -1,4 +1,4 @@
-"""What all Gymnasium tasks share: model, engine, resets, finiteness check, time limit."""
+"""Base of all Gymnasium tasks: model, engine, resets, finiteness check, time limit."""
 
 import abc
 
@@ -44,7 +44,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     MISSING_VERSIONS: dict[str, str] = {}
     """Why a version is not available, by version."""
     MODEL_NEEDS: models.ModelNeeds = models.ModelNeeds()
-    """What the task reads of a model by index."""
+    """Sizes of a model that the task reads by index."""
     HAS_X: bool = True
     """Whether `qpos[0]` is the root's forward coordinate x."""
     HAS_Y: bool = True
@@ -52,7 +52,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     HEIGHT_INDEX: int | None = None
     """Index of the root's height in `qpos`. None: the root cannot leave the ground."""
     VIEW: View = View()
-    """What films show of the task's own model. `view` is for the model of `xml_file`."""
+    """View of the task's own model. `view` is for the model of `xml_file`."""
 
     @standard_dtypes()
     def __init__(self, options: TaskOptions, physics: str = "auto", keep_info: bool = False):

@@ -38,7 +38,7 @@ class VectorState(flax.struct.PyTreeNode):
 
 
 class Outcome(NamedTuple):
-    """What a step led to, before any reset: `[B, …]`."""
+    """Result of a step, before any reset: `[B, …]`."""
 
     obs: jax.Array
     """The true next observation, terminal ones included."""

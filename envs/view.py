@@ -1,4 +1,4 @@
-"""What films, pages and gait sheets show of a task."""
+"""View of a task in films, pages and gait sheets."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ __all__ = ["View"]
 
 
 class View(NamedTuple):
-    """What films, pages and gait sheets show of a task."""
+    """Body and camera that films, pages and gait sheets of a task use."""
 
     body: int = 1
     """Body whose height and speed they show. In Gymnasium's models, body 1 is the root, and the world is body 0."""

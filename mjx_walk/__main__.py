@@ -63,7 +63,7 @@ def _without_command(command: str) -> int:
 
 
 def _meant(argument: str) -> str:
-    """What may be meant by an argument in the place of the command, or nothing."""
+    """Suggest what an argument in the place of the command may mean, or nothing."""
     key, equals, _ = argument.lstrip("-").partition("=")
     if argument.startswith("zoo:"):
         return f"play run={argument}"

@@ -1,4 +1,4 @@
-"""What the MJX engines simulate otherwise than MuJoCo's C library. The user is warned of it."""
+"""Differences between the MJX engines and MuJoCo's C library, of which the user is warned."""
 
 import logging
 from collections.abc import Iterator

@@ -40,7 +40,7 @@ class Engine(Protocol):
     calls_host: bool
     """Whether it steps in a host callback. JAX does not cache compiled programs that contain one."""
     preparation: Preparation
-    """What must end before its programs run."""
+    """Work that must end before the engine's programs run."""
 
     def forward(self, state: PhysicsState) -> Derived:
         """Derived arrays of a new state at zero control. Source: Gymnasium's `set_state` (`mj_forward`).

@@ -1,4 +1,4 @@
-"""What an engine prepares in the background, while its programs are compiled."""
+"""Work that an engine does in the background while its programs are compiled."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""What an engine does not simulate. A model that has it is refused before compilation; the error names the element.
+"""Elements that an engine does not simulate. A model with one is refused before compilation, by the element's name.
 
 MuJoCo's complete state is `mjSTATE_INTEGRATION`. `PhysicsState` carries position, velocity and the solver's initial
 guess. Mocap bodies and equality flags never change during an episode, so they need not be carried. The rest is refused
@@ -28,7 +28,7 @@ class _Feature(NamedTuple):
     what: str
     """The feature, as the subject of a sentence."""
     advice: str
-    """What to change in the model."""
+    """Change of the model that makes it acceptable."""
 
 
 def refuse_unsupported(model: mujoco.MjModel, engine: str) -> None:

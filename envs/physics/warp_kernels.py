@@ -99,7 +99,7 @@ class _Progress:
 
 
 def launched_variants(model: mujoco.MjModel, njmax: int) -> Variants:
-    """What a step launches on Warp's present device. Nothing is launched, so nothing is compiled."""
+    """Kernels that a step launches on Warp's present device. Nothing is launched, so nothing is compiled."""
     warp_model = mujoco_warp.put_model(model)
     warp_model.opt.warn_overflow = 0  # as the engine sets it; kernels depend on it
     data = mujoco_warp.make_data(model, nworld=1, njmax=njmax)

@@ -1,4 +1,4 @@
-"""What TD3 and DDPG share: a deterministic policy, critics whose minimum is the target, and Gaussian exploration."""
+"""Base of TD3 and DDPG: a deterministic policy, critics whose minimum is the target, and Gaussian exploration."""
 
 import dataclasses
 from typing import ClassVar, TypeVar

@@ -1,4 +1,4 @@
-"""What SAC, TD3 and DDPG share: acting with noise, the replay, n-step targets, and the schedule of gradient updates."""
+"""Base of SAC, TD3 and DDPG: acting with noise, the replay, n-step targets, and the schedule of gradient updates."""
 
 import abc
 import dataclasses

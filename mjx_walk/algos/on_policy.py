@@ -1,4 +1,4 @@
-"""What PPO, A2C and REINFORCE share: networks, rollouts with bootstrapped time limits, and the end of an update."""
+"""Base of PPO, A2C and REINFORCE: networks, rollouts with bootstrapped time limits, and the end of an update."""
 
 import dataclasses
 import functools
@@ -44,7 +44,7 @@ class OnPolicyState(TrainState):
 
 
 class OnPolicyBatch(flax.struct.PyTreeNode):
-    """What one `collect` hands to `learn`: N = U·B unrolls of T steps."""
+    """Batch that one `collect` hands to `learn`: N = U·B unrolls of T steps."""
 
     transitions: Transition
     """`[N, T, …]`. What Brax's PPO loss does not read is left out: `action` is empty (the raw action is in `extras`),

@@ -1,4 +1,4 @@
-"""What A2C and REINFORCE share: one pass over a batch with the plain policy gradient."""
+"""Base of A2C and REINFORCE: one pass over a batch with the plain policy gradient."""
 
 import dataclasses
 from typing import NamedTuple, TypeVar

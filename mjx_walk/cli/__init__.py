@@ -1,4 +1,4 @@
-"""What a user types and reads in a terminal: arguments, messages, exit codes, and the streams they are written to.
+"""The terminal: arguments, messages, exit codes, and the streams they are written to.
 
 The settings of a training are in `settings`, because Hydra parses them.
 """

@@ -1,4 +1,4 @@
-"""What a command prints: log messages, warnings in one line, and output whose reader may end before the command."""
+"""Output of a command: log messages, warnings in one line, and streams whose reader may end before the command."""
 
 import contextlib
 import logging

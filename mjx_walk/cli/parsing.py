@@ -1,4 +1,4 @@
-"""What all commands share: `key=value` arguments, output, and exit codes.
+"""Frame of all commands: `key=value` arguments, output, and exit codes.
 
 Invalid input prints a one-line error and exits with code 2.
 """

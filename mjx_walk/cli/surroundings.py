@@ -1,4 +1,4 @@
-"""What a command needs of the system around it: a working folder, text that can be written, and disks."""
+"""Checks of the system around a command: a working folder, text that can be written, and disks."""
 
 import errno
 import os
@@ -44,7 +44,7 @@ def _is_text(text: str) -> bool:
 
 
 def correctable(error: OSError) -> str | None:
-    """What to print of an error that the user can correct, outside this package. None for others."""
+    """Message for an error from outside this package that the user can correct. None for others."""
     if error.errno in _DISK_ERRORS:
         return str(error)
     if (error.strerror or "").startswith("No usable temporary directory"):

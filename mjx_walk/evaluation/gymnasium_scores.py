@@ -30,7 +30,7 @@ _MAX_PARALLEL_EPISODES = 1024
 
 @dataclasses.dataclass
 class ScoreRequest:
-    """What a user asks to be scored."""
+    """Policy, task and episodes that a user asks to be scored."""
 
     episodes: int = setting(100, at_least=1)
     backend: str = setting("gymnasium", choices=("gymnasium", "sim"))

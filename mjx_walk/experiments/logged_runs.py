@@ -1,4 +1,4 @@
-"""What runs have logged, grouped by algorithm and settings, and statistics over seeds."""
+"""Logs of runs, grouped by algorithm and settings, and statistics over seeds."""
 
 import dataclasses
 import warnings

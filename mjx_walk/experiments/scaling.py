@@ -121,7 +121,7 @@ def _speeds(name: str, speed: Speed, alone: float | None) -> Iterator[Measuremen
 
 
 def _parts(name: str, overrides: list[str], size: int) -> Iterator[Measurement]:
-    """What the first device does in a call, from a training of its own: recording changes the speed.
+    """Work of the first device in a call, from a training of its own: recording changes the speed.
 
     On GPUs, a process that records may crash or hang (jax 0.11, Warp 1.18). Its parts are then left out. Recording a
     second call hangs on one GPU, so only one is recorded.

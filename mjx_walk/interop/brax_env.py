@@ -42,7 +42,7 @@ _INSTEAD = {
     "actuator.bias_qd": "actuator_biasprm",
     "actuator.force_range": "actuator_forcerange",
 }
-"""What MJX reads instead of the values of Brax's own engines."""
+"""Fields that MJX reads instead of the values of Brax's own engines."""
 _READ_IF_ANY = (
     ("opt.density", "opt.viscosity", "opt.wind"),
     ("dof_frictionloss",),

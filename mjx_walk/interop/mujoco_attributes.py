@@ -1,4 +1,4 @@
-"""What code for Gymnasium's MuJoCo environments reads of them: the model, times, state and frames.
+"""Attributes of Gymnasium's MuJoCo environments that other code reads: the model, times, state and frames.
 
 Each environment holds one of Gymnasium, which draws resets and renders, and is never stepped.
 """

@@ -1,4 +1,4 @@
-"""What a run says while it runs: metrics, log rows, their loggers, and progress.
+"""Output of a run while it trains: metrics, log rows, their loggers, and progress.
 
 Pictures are in `viewing`, and scores are in `storage`.
 """

@@ -28,7 +28,7 @@ _VALUES_PER_ROW = 8
 _MAX_LINES = 1_000_000
 _MAX_NAME = 10_000
 _FORMULA = ("=", "+", "-", "@")
-"""What a spreadsheet takes for the start of a formula."""
+"""Characters that a spreadsheet takes for the start of a formula."""
 _MAX_CELLS = 20_000_000
 """Cells of a CSV file, with the empty ones. A stranger's rows may each have names of their own."""
 _MANY = 0.01

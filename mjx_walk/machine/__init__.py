@@ -1,4 +1,4 @@
-"""What a program needs of the machine: devices, drivers, OpenGL, processes, signals, and the supported releases of JAX.
+"""The machine below a program: devices, drivers, OpenGL, processes, signals, and the supported releases of JAX.
 
 Nothing here knows tasks, runs or commands.
 """

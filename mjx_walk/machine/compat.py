@@ -1,4 +1,4 @@
-"""What the supported releases of JAX and MJX need. Programs call these functions; no import does."""
+"""Patches that the supported releases of JAX and MJX need. Programs call these functions; no import does."""
 
 import contextlib
 import gc

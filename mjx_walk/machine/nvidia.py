@@ -40,7 +40,7 @@ _HIDING = ("", "-1", "none", "void", "NoDevFiles")
 
 @dataclasses.dataclass(frozen=True)
 class Machine:
-    """What decides whether a program can use an NVIDIA GPU."""
+    """Facts that decide whether a program can use an NVIDIA GPU."""
 
     has_gpu: bool = False
     """Whether there is a GPU, be it out of reach."""

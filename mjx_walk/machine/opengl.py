@@ -1,4 +1,4 @@
-"""What OpenGL this machine has, and MuJoCo's import where `MUJOCO_GL` does not work or a standard stream is closed.
+"""OpenGL of this machine, and MuJoCo's import where `MUJOCO_GL` does not work or a standard stream is closed.
 
 This module does not import JAX.
 """

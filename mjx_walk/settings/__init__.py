@@ -1,4 +1,4 @@
-"""What a run is set to: the schema, recipes, overrides, files that settings name, and the saved configuration.
+"""Settings of a run: the schema, recipes, overrides, files that settings name, and the saved configuration.
 
 Modules turn a command line into checked dataclasses and back. Parsing of other commands is in `cli`.
 """

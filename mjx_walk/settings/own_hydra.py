@@ -27,7 +27,7 @@ _STATE = (ConfigStore, GlobalHydra, HydraConfig, JobRuntime, VersionBase)
 _own: dict[type, Any] = {}
 """This package's `ConfigStore`, once it is made."""
 _registered: dict[tuple[str | None, str], type] = {}
-"""What it holds, by group and name."""
+"""Nodes by group and name."""
 
 
 @contextlib.contextmanager

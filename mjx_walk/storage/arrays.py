@@ -33,7 +33,7 @@ _MAX_OVERHEAD, _MAX_OVERHEAD_OF_NUMPY = 100_000_000, 10_000_000
 """Bytes of a folder beyond twice those of its arrays. TensorStore ends the process if its index exceeds the memory,
 and Python keeps each entry of an archive's directory there."""
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""What NumPy writes. Python would unpack other kinds without a limit of their memory."""
+"""Kinds that NumPy writes. Python would unpack other kinds without a limit of their memory."""
 
 
 class ShapeAndDtype(Protocol):
@@ -101,7 +101,7 @@ def _write_tensorstore(base: dict[str, object], arrays: HostArrays) -> None:
 
 
 def _metadata_of_orbax(arrays: HostArrays) -> dict[str, object]:
-    """What Orbax reads to restore the arrays as a dictionary."""
+    """Metadata that Orbax reads to restore the arrays as a dictionary."""
     value = {"value_type": "np.ndarray", "skip_deserialize": False}
     tree = {str((name,)): {"key_metadata": [{"key": name, "key_type": 2}], "value_metadata": value} for name in arrays}
     formats = {"use_ocdbt": True, "use_zarr3": False, "store_array_data_equal_to_fill_value": True}

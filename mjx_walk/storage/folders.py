@@ -52,7 +52,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
 
 def _identity(folder: Path) -> tuple[int, int] | None:
-    """What stays the same when a folder is moved; None if there is none to be seen."""
+    """Identity of a folder, which stays the same when it is moved. None if the system shows none."""
     try:
         status = folder.stat()
     except OSError:

@@ -127,7 +127,7 @@ def open_existing(path: str | Path | None) -> RunFolder:
 
 
 def _where_a_run_is(path: Path) -> str:
-    """What to give instead of a path that is no run folder."""
+    """Advice for a path that is no run folder."""
     above = next((parent for parent in path.parents if RunFolder(parent).config.is_file()), None)
     if above:
         return f"give the run's folder, {above}"

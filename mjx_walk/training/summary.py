@@ -27,7 +27,7 @@ def score_lines(
 
 
 def choice_line(taken: str) -> str:
-    """What to say where a command has taken one of a run's two policies by itself.
+    """Message of a command that has chosen one of a run's two policies by itself.
 
     Args:
         taken: `final` or `best`.

@@ -226,7 +226,7 @@ class Trainer:
             return float(self._evaluate(policy_params, key))
 
     def _divergence(self, state: TrainState, call: int) -> str:
-        """What has diverged, with the first learned leaf that is not finite of each run that has one."""
+        """Name the runs that have diverged, each with its first learned leaf that is not finite."""
         found = []
         for seed, own in zip(self._seeds, self._program.split(without_replay(state)), strict=True):
             names = [name for name, leaf in learned_leaves(own).items() if not jnp.isfinite(leaf).all()]

@@ -13,7 +13,7 @@ _DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
 _MAX_LENGTH = 2000
 """Characters of a message; more would fill the screen."""
 _MARKUP = re.compile(r"[\\`|<>$]|\](?=\()")
-"""What begins an element, a formula or code in Markdown, makes a link, or ends a table's cell."""
+"""Characters that begin an element, a formula or code in Markdown, make a link, or end a table's cell."""
 
 
 def has_controls(text: str) -> bool:

@@ -35,7 +35,7 @@ def plain_type(hint: object) -> object:
 
 
 def type_problem(value: object, hint: object) -> str | None:
-    """What is wrong with the type of a value, or None. Types that no setting of this package has are not checked.
+    """Describe the wrong type of a value, or return None. Types that no setting of this package has are not checked.
 
     Args:
         value: the value.
@@ -88,7 +88,7 @@ def with_whole_number(text: str) -> str:
 
 
 def _correction(key: str, text: str, kind: object) -> str:
-    """What to type instead of a text, if it can be guessed."""
+    """Suggest what to type instead of a text, if it can be guessed."""
     if kind is int:
         in_units = re.fullmatch(rf"({_NUMBER})([kKmMbB])", text)
         if re.fullmatch(r"\d{1,3}(,\d{3})+", text):

@@ -1,4 +1,4 @@
-"""What people look at: films, 3D pages, gait sheets, the live viewer and the learning curves of one run.
+"""Pictures of a run: films, 3D pages, gait sheets, the live viewer and learning curves.
 
 Training, scoring, and formats that other software reads do not belong here.
 """

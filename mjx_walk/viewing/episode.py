@@ -34,7 +34,7 @@ class Episode:
     qpos: np.ndarray
     """`[T, nq]`."""
     view: View
-    """What the task shows."""
+    """The task's view."""
     body: np.ndarray
     """`[T, 3]`, position of the body that the view names."""
     motor_forces: np.ndarray
