@@ -90,7 +90,7 @@ def _has_enough_memory(path: Path, model: mujoco.MjModel) -> bool:
     if all(size < 0 for size in (spec.memory, spec.nstack, spec.njmax, spec.nconmax)):  # MuJoCo chooses
         return True
     spec.memory = spec.nstack = spec.njmax = spec.nconmax = -1
-    with hide_deprecations():
+    with warnings.catch_warnings(action="ignore"), hide_deprecations():
         if model.narena >= spec.compile().narena:
             return True
     worst = copy.deepcopy(model)
