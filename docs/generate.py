@@ -7,7 +7,7 @@ a test fails if a committed page differs.
 from pathlib import Path
 
 from generator import best_recipes, measured_tables, scaling, score_tables, seed_tables, setting_tables, task_pages
-from generator.markdown import with_block
+from generator.markdown import toctree, with_block
 
 from mjx_walk import zoo
 from mjx_walk.algos import BUILT_IN_ALGORITHMS
@@ -21,13 +21,17 @@ _OF_SCORES = ("best_evaluations", "complete_episodes", "cpu", "cpu_tasks", "inst
 def pages() -> dict[Path, str]:
     """Every page with generated parts, as it must be, by its path."""
     found = {DOCS / "tasks" / f"{name}.md": task_pages.page(name) for name in BUILT_IN_TASKS}
-    found[DOCS / "tasks" / "index.md"] = _filled("tasks/index.md", {"tasks": task_pages.overview_of_all()})
+    index = {"tasks": task_pages.overview_of_all(), "pages": toctree(BUILT_IN_TASKS)}
+    found[DOCS / "tasks" / "index.md"] = _filled("tasks/index.md", index)
     groups = {name: setting_tables.group_table(name) for name in setting_tables.GROUPS}
     found[DOCS.parent / "README.md"] = _filled("../README.md", {"best": best_recipes.summary()})
     for page, blocks in _figures().items():
         found[DOCS / page] = _filled(page, blocks)
     found[DOCS / "training.md"] = _filled("training.md", {"scaling-summary": scaling.summary()})
     found[DOCS / "configuration.md"] = _filled("configuration.md", groups)
+    texts = {name: (DOCS / "algorithms" / f"{name}.md").read_text() for name in BUILT_IN_ALGORITHMS}
+    index = {"algorithms": setting_tables.algorithms(texts), "pages": toctree(BUILT_IN_ALGORITHMS)}
+    found[DOCS / "algorithms" / "index.md"] = _filled("algorithms/index.md", index)
     for name in BUILT_IN_ALGORITHMS:
         blocks = {"settings": setting_tables.algorithm_table(name), "scores": score_tables.of_algorithm(name)}
         found[DOCS / "algorithms" / f"{name}.md"] = _filled(f"algorithms/{name}.md", blocks)

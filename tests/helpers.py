@@ -80,6 +80,8 @@ _SMALL_OFF_POLICY = {
     "policy_hidden_layer_sizes": (4,),
     "critic_hidden_layer_sizes": (4,),
 }
+ON_POLICY = [name for name, (_, config) in ALGORITHMS.items() if issubclass(config, OnPolicyConfig)]
+OFF_POLICY = [name for name in ALGORITHMS if name not in ON_POLICY]
 OPTIMIZED = {"xla_backend_optimization_level": 1}
 """Options of `jax.jit` for programs that take longer to run than to compile; see `conftest`."""
 
@@ -171,6 +173,11 @@ def command_here(module: str, *arguments: str) -> int:
         with pytest.raises(SystemExit) as ended:
             runpy.run_module(f"mjx_walk.{module}", run_name="__main__", alter_sys=True)
     return ended.value.code
+
+
+def used_settings(algo):
+    """Names of the settings of an algorithm, without inherited ones that never have an effect."""
+    return {field.name for field in dataclasses.fields(ALGORITHMS[algo][1]) if field.metadata.get("only_if") != {}}
 
 
 def small_settings(algo, **further):

@@ -28,7 +28,7 @@ CASES = [
     (["-m", ""], "an argument is empty; write KEY=VALUE"),
     (["seed=1", "seeds=2"], "give seed=N or seeds=[…], not both"),
     (["seeds=[1,1]"], "seeds=[1, 1]: give a number of seeds, or a list of different seeds from 0 up"),
-    (["algo=dqn"], "unknown algo 'dqn'; choose one of: ppo, sac, csac, td3, ddpg, a2c, reinforce"),
+    (["algo=dqn"], f"unknown algo 'dqn'; choose one of: {', '.join(ALGORITHMS)}"),
     (["physics=bullet"], "physics=bullet: choose one of: auto, warp, jax, c"),
     (["env.version=v3"], "env.version=v3: choose one of: v5, v4"),
     (["recipe=nope"], "recipes for env=humanoid algo=ppo: cpu/humanoid_ppo, gpu/humanoid_ppo"),

@@ -25,6 +25,17 @@ def code(text: object) -> str:
     return f"`{text}`" if str(text) else ""
 
 
+def toctree(names: Iterable[str]) -> str:
+    """Sphinx's hidden list of the pages in a folder."""
+    return "\n".join(["```{toctree}", ":hidden:", "", *names, "```"])
+
+
+def first_sentence(page: str) -> str:
+    """The first sentence below the title of a page."""
+    paragraph = page.split("\n\n")[1].replace("\n", " ")
+    return paragraph.partition(". ")[0].removesuffix(".") + "."
+
+
 def with_block(page: str, name: str, content: str) -> str:
     """A page with one of its generated blocks replaced.
 

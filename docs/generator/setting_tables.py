@@ -1,7 +1,8 @@
 """Tables of settings, from the dataclasses that declare them."""
 
-from generator.markdown import code, table
+from generator.markdown import code, first_sentence, table
 from mjx_walk.algos import ALGORITHMS
+from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.envs import TASKS
 from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.reward_shaping import Shaping
@@ -50,6 +51,19 @@ def group_table(name: str) -> str:
 def algorithm_table(name: str) -> str:
     """The settings of an algorithm."""
     return settings_table(ALGORITHMS[name][1], "algo.")
+
+
+def algorithms(pages: dict[str, str]) -> str:
+    """The table of all algorithms.
+
+    Args:
+        pages: the page of each algorithm, by its name.
+    """
+    rows = []
+    for name, page in pages.items():
+        data = "unrolls of the policy" if issubclass(ALGORITHMS[name][1], OnPolicyConfig) else "a replay buffer"
+        rows.append([f"[`{name}`]({name}.md)", data, first_sentence(page)])
+    return table(["`algo=`", "Learns from", "In short"], rows)
 
 
 def all_schemas() -> list[type]:

@@ -1,6 +1,7 @@
 """A page for each task, from its class, its options and its MuJoCo model."""
 
 import dataclasses
+from pathlib import Path
 
 import mujoco
 
@@ -12,6 +13,8 @@ from mjx_walk import zoo
 from mjx_walk.envs import TASKS, Task, make_env
 from mjx_walk.utils import setting_fields
 
+PAGES = Path(__file__).parents[1] / "tasks"
+
 
 def page(name: str) -> str:
     """The page of a task."""
@@ -20,9 +23,9 @@ def page(name: str) -> str:
     parts = [
         f"# {task.GYMNASIUM_NAME}",
         f"{text.goal} It is Gymnasium's `{task.gymnasium_id}`. Numbers and tables are those of v5.",
-        f"![{text.goal.removesuffix('.')}]({name}.webp)",
+        *_picture(name, text),
         f"```\npython -m mjx_walk.train env={name}\n```",
-        _shipped_policies(name),
+        *_shipped_policies(name),
         _overview(tasks),
         "## Actions",
         _actions(task),
@@ -60,9 +63,14 @@ def overview_of_all() -> str:
     return table(titles, rows)
 
 
-def _shipped_policies(name: str) -> str:
+def _picture(name: str, text: TaskText) -> list[str]:
+    """The film of a shipped policy, if there is one."""
+    return [f"![{text.goal.removesuffix('.')}]({name}.webp)"] if (PAGES / f"{name}.webp").exists() else []
+
+
+def _shipped_policies(name: str) -> list[str]:
     own = [code(f"{zoo.PREFIX}{policy}") for policy in zoo.names() if policy.startswith(f"{name}-")]
-    return f"Policies that come with the package: {', '.join(own)}."
+    return [f"Policies that come with the package: {', '.join(own)}."] if own else []
 
 
 def _integrator(task: Task) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import toy_tasks
 from brax.training.acme import running_statistics
-from helpers import OPTIMIZED, slow_except
+from helpers import OFF_POLICY, ON_POLICY, OPTIMIZED, slow_except, used_settings
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.common import networks
@@ -21,7 +21,16 @@ pytestmark = pytest.mark.filterwarnings("ignore:Some donated buffers")
 
 DISCOUNT = 0.5
 SMALL = {"policy_hidden_layer_sizes": (32, 32), "discount": DISCOUNT, "reward_scale": 1.0}
-OFF_POLICY = SMALL | {
+ON_POLICY_SETTINGS = SMALL | {
+    "value_hidden_layer_sizes": (32, 32),
+    "unroll_length": 8,
+    "learning_rate": 1e-2,
+    "init_noise_std": 0.3,
+    # With normalized advantages a noiseless task never stops to shrink the policy's std.
+    "normalize_advantages": False,
+    "entropy_coef": 1e-3,
+}
+OFF_POLICY_SETTINGS = SMALL | {
     "critic_hidden_layer_sizes": (32, 32),
     "batch_size": 64,
     "unroll_length": 1,
@@ -31,44 +40,32 @@ OFF_POLICY = SMALL | {
     "tau": 0.05,
     "policy_learning_rate": 1e-3,
     "critic_learning_rate": 3e-3,
+    "min_exploration_noise": 0.1,
+    "max_exploration_noise": 0.8,
+    "init_alpha": 1e-3,
+    "alpha_learning_rate": 1e-6,
 }
-DETERMINISTIC = OFF_POLICY | {"min_exploration_noise": 0.1, "max_exploration_noise": 0.8}
-SETTINGS = {
-    "ppo": SMALL
-    | {
-        "value_hidden_layer_sizes": (32, 32),
-        "unroll_length": 4,
-        "num_unrolls": 2,
-        "num_minibatches": 4,
-        "learning_rate": 3e-3,
-        # With normalized advantages a noiseless task never stops to shrink the policy's std.
-        "normalize_advantages": False,
-        "entropy_coef": 1e-3,
-    },
-    "a2c": SMALL
-    | {
-        "value_hidden_layer_sizes": (32, 32),
-        "unroll_length": 8,
-        "learning_rate": 1e-2,
-        "init_noise_std": 0.3,
-        "normalize_advantages": False,
-        "entropy_coef": 1e-3,
-    },
-    "reinforce": SMALL | {"unroll_length": 8, "learning_rate": 1e-2, "entropy_coef": 1e-2},
-    "sac": OFF_POLICY | {"init_alpha": 1e-3, "alpha_learning_rate": 1e-6},
-    "csac": OFF_POLICY
-    | {"init_alpha": 1e-3, "alpha_learning_rate": 1e-6, "normalize_rewards": False, "normalized_return_max": 3.0},
-    "td3": DETERMINISTIC,
-    "ddpg": DETERMINISTIC,
+OWN_SETTINGS = {
+    "ppo": {"unroll_length": 4, "num_unrolls": 2, "num_minibatches": 4, "learning_rate": 3e-3, "init_noise_std": 1.0},
+    "reinforce": {"init_noise_std": 1.0, "entropy_coef": 1e-2},
+    "csac": {"normalize_rewards": False, "normalized_return_max": 3.0},
 }
-UPDATES = {"ppo": 60, "a2c": 400, "reinforce": 400, "sac": 400, "csac": 400, "td3": 400, "ddpg": 400}
+UPDATES = {"ppo": 60}
+"""By name; 400 for other algorithms."""
+
+
+def settings_of(name):
+    """The settings of the base class that an algorithm uses, and its own."""
+    settings = ON_POLICY_SETTINGS if name in ON_POLICY else OFF_POLICY_SETTINGS
+    used = used_settings(name)
+    return {key: value for key, value in settings.items() if key in used} | OWN_SETTINGS.get(name, {})
 
 
 def values(name, task, config, state, obs):
     """What the algorithm believes the observations, `[N, 1]`, to be worth under its policy."""
-    if name == "reinforce":
-        return jnp.full(len(obs), jnp.nan)  # it has none
-    if name in ("ppo", "a2c"):
+    if name in ON_POLICY and "value_hidden_layer_sizes" not in used_settings(name):
+        return jnp.full(len(obs), jnp.nan)
+    if name in ON_POLICY:
         nets = networks.make_ppo_networks(task, config)
         return nets.value_network.apply(state.normalizer, state.params.value, obs)
     algorithm = ALGORITHMS[name][0](task, 8, EvaluationConfig(1), config)
@@ -84,10 +81,10 @@ def values(name, task, config, state, obs):
 def train(name, task, **changes):
     """Value and action at a few observations after training, and whether the metrics are finite."""
     make, config_class = ALGORITHMS[name]
-    config = config_class(**SETTINGS[name] | changes)
+    config = config_class(**settings_of(name) | changes)
     algorithm = make(task, 32, EvaluationConfig(1), config)
     state = make_init(algorithm.init)(jax.random.PRNGKey(0))
-    state, metrics = make_step(algorithm.collect, algorithm.learn, UPDATES[name], fused=True)(state)
+    state, metrics = make_step(algorithm.collect, algorithm.learn, UPDATES.get(name, 400), fused=True)(state)
     obs = jnp.float32([[-1.0], [0.0], [1.0]])
     action = algorithm.policy(algorithm.policy_params(state), deterministic=True)(obs, jax.random.PRNGKey(0))
     return values(name, task, config, state, obs), action[:, 0], jnp.isfinite(metrics["episodes"].value).all()
@@ -105,8 +102,9 @@ def trained(name):
 
 
 FAST = ("ppo", "sac")
-algorithms = pytest.mark.parametrize("name", slow_except(FAST, SETTINGS))
-with_values = pytest.mark.parametrize("name", slow_except(FAST, [name for name in SETTINGS if name != "reinforce"]))
+WITH_VALUES = [name for name in ALGORITHMS if name in OFF_POLICY or "value_hidden_layer_sizes" in used_settings(name)]
+algorithms = pytest.mark.parametrize("name", slow_except(FAST, ALGORITHMS))
+with_values = pytest.mark.parametrize("name", slow_except(FAST, WITH_VALUES))
 
 
 @with_values
@@ -139,7 +137,7 @@ def test_a_discount_that_changes(name):
 def test_an_entropy_that_changes():
     make, config_class = ALGORITHMS["sac"]
     changes = {"target_entropy": 0.3, "final_target_entropy": -1.0, "schedule_steps": 300 * 32}
-    config = config_class(**OFF_POLICY | changes | {"init_alpha": 0.1, "alpha_learning_rate": 3e-3})
+    config = config_class(**settings_of("sac") | changes | {"init_alpha": 0.1, "alpha_learning_rate": 3e-3})
     task = toy_tasks.RewardedAction(10)
     algorithm = make(task, 32, EvaluationConfig(1), config)
     state, _ = make_step(algorithm.collect, algorithm.learn, 2100, fused=True)(
@@ -167,8 +165,8 @@ def test_reward_for_an_action(name):
 def test_reward_for_an_action_that_suits_the_observation(name):
     value, action = trained(name)[toy_tasks.RewardedObservedAction]
     assert action[[0, 2]] == pytest.approx([-0.5, 0.5], abs=0.15)
-    if name != "reinforce":
-        assert value[[0, 2]] == pytest.approx([0.0, 0.0], abs=0.5 if name in ("ppo", "a2c") else 0.1)
+    if name in WITH_VALUES:
+        assert value[[0, 2]] == pytest.approx([0.0, 0.0], abs=0.5 if name in ON_POLICY else 0.1)
 
 
 def test_mountain_car_equals_gymnasiums():
@@ -196,7 +194,7 @@ def test_mountain_car_equals_gymnasiums():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["sac", "csac", "td3", "ddpg"])
+@pytest.mark.parametrize("name", OFF_POLICY)
 def test_mountain_car_is_solved(name):
     """No reward until the top, which noise reaches only when each draw is kept for a while. Solved is 90."""
     changes = {
@@ -214,7 +212,7 @@ def test_mountain_car_is_solved(name):
     soft = {"init_alpha": 1.0, "alpha_learning_rate": 3e-4, "target_entropy": 0.0}
     own = {"sac": soft, "csac": soft | {"normalized_return_max": 10.0}}
     make, config_class = ALGORITHMS[name]
-    config = config_class(**SETTINGS[name] | changes | own.get(name, {"max_exploration_noise": 1.0}))
+    config = config_class(**settings_of(name) | changes | own.get(name, {"max_exploration_noise": 1.0}))
     algorithm = make(toy_tasks.MountainCar(), 64, EvaluationConfig(8), config)
     step = make_step(algorithm.collect, algorithm.learn, 700, fused=True)
     train_once = jax.jit(lambda key: step(make_init(algorithm.init)(key)), compiler_options=OPTIMIZED)

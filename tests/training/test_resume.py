@@ -11,7 +11,9 @@ import subprocess
 import numpy as np
 import pytest
 from helpers import (
+    OFF_POLICY,
     OLD_RUNS,
+    ON_POLICY,
     TINY,
     TINY_CALL,
     TINY_OFF_POLICY,
@@ -89,7 +91,7 @@ def test_n_and_n_calls_equal_2n(tmp_path, physics, six_calls):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algo", ["sac", "csac", "td3", "ddpg"])
+@pytest.mark.parametrize("algo", OFF_POLICY)
 def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
     """The first half ends after the replay has gone round, with truncated episodes in it."""
     train_here(tmp_path / "full", f"algo={algo}", f"total_steps={9 * TINY_CALL}", tiny=TINY_OFF_POLICY)
@@ -106,7 +108,7 @@ def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algo", ["a2c", "reinforce"])
+@pytest.mark.parametrize("algo", [algo for algo in ON_POLICY if algo != "ppo"])
 def test_policy_gradient_resume_is_exact(tmp_path, algo):
     settings = [
         f"algo={algo}",
