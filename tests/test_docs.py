@@ -28,7 +28,7 @@ def test_committed_pages_are_what_the_code_gives():
     assert names == {
         *("../README.md", "results.md", "results_archive.md", "speed.md", "training.md"),
         *(f"tasks/{name}.md" for name in ("index", *BUILT_IN_TASKS)),
-        *(f"algorithms/{name}.md" for name in BUILT_IN_ALGORITHMS),
+        *(f"algorithms/{name}.md" for name in ("index", *BUILT_IN_ALGORITHMS)),
         "configuration.md",
     }
 

@@ -32,8 +32,8 @@ def has_file(name: str) -> bool:
 def fallback(name: str) -> str | None:
     """The recipe from which `HARDWARE/ENV_ALGO` without a file takes its settings. None for other names.
 
-    A task or an algorithm of a user counts as the one of this package from which its class derives. A task that derives
-    from none takes the algorithm's defaults. An algorithm that derives from none takes no recipe, `""`.
+    A task or an algorithm without files takes those of the class from which it derives. A task that derives from none
+    takes the algorithm's defaults. An algorithm that derives from none takes no recipe, `""`.
     """
     if has_file(name):
         return None
@@ -46,10 +46,8 @@ def fallback(name: str) -> str | None:
     configs = {ALGORITHMS[known][1]: known for known in BUILT_IN_ALGORITHMS}
     task = next((tasks[kind] for kind in TASKS[env][0].__mro__ if kind in tasks), None)
     kinds = ALGORITHMS[both.removeprefix(f"{env}_")][1].__mro__
-    algo = next((configs[kind] for kind in kinds if kind in configs), None)
-    if algo is None:
-        return ""
-    return next(found for found in (f"{size}/{task}_{algo}", f"{size}/{algo}") if has_file(found))
+    algos = [configs[kind] for kind in kinds if kind in configs]
+    return next((f for algo in algos for f in (f"{size}/{task}_{algo}", f"{size}/{algo}") if has_file(f)), "")
 
 
 def fitting_recipes(env: str, algo: str) -> str:
