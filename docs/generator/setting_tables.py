@@ -3,8 +3,8 @@
 from generator.markdown import code, first_sentence, table
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.envs import TASKS
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.reward_shaping import Shaping
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.settings.config import CheckpointConfig, Config
