@@ -128,6 +128,9 @@ def test_a_renderer_is_tried_in_a_process_of_its_own(monkeypatch):
     for probe, works in (("import os; assert os.environ['MUJOCO_GL'] == 'x'", True), ("raise SystemExit(1)", False)):
         monkeypatch.setattr(rendering, "_PROBE", probe)
         assert rendering._works.__wrapped__("x") is works
+    monkeypatch.setattr(rendering, "_PROBE", "import time; time.sleep(60)")  # a driver that hangs
+    monkeypatch.setattr(rendering, "_PROBE_SECONDS", 0.2)
+    assert rendering._works.__wrapped__("x") is False
 
 
 @pytest.mark.slow

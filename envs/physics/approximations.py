@@ -4,8 +4,10 @@ import logging
 from collections.abc import Iterator
 
 import mujoco
+import numpy as np
+from jaxtyping import Int
 
-from mjx_walk.envs.physics import elements
+from mjx_walk.envs.physics.elements import pairs_that_move
 
 __all__ = ["warn_of_approximations"]
 
@@ -49,12 +51,28 @@ def warn_of_approximations(model: mujoco.MjModel, engine: str, enough_iterations
 
 def _other_contacts(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
     """Pairs of geoms whose contacts `jax` finds at other points than MuJoCo."""
-    geoms, _ = elements.pairs_that_move(model)
+    geoms, _ = pairs_that_move(model)
     for first, second in geoms.tolist():
         if (_kind(model, first), _kind(model, second)) not in _AS_IN_MUJOCO:
             yield first, second
-    yield from elements.parallel_capsules(model)
+    yield from _parallel_capsules(model, geoms)
 
 
 def _kind(model: mujoco.MjModel, geom: int) -> mujoco.mjtGeom:
     return mujoco.mjtGeom(model.geom_type[geom])
+
+
+def _parallel_capsules(model: mujoco.MjModel, geoms: Int[np.ndarray, "n 2"]) -> Iterator[tuple[int, int]]:
+    """Pairs of capsules that are parallel in every pose. MuJoCo gives them two contacts, `jax` one."""
+    geoms = geoms[(model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_CAPSULE).all(axis=1)]
+    if not geoms.size:
+        return
+    data = mujoco.MjData(model)
+    is_parallel = np.ones(len(geoms), bool)
+    for speed in (0.0, 1.0, 2.0):
+        mujoco.mj_integratePos(model, data.qpos, speed * np.sin(1.0 + np.arange(model.nv)), 1.0)
+        mujoco.mj_kinematics(model, data)
+        axes = data.geom_xmat.reshape(-1, 3, 3)[geoms, :, 2]
+        is_parallel &= np.linalg.norm(np.cross(axes[:, 0], axes[:, 1]), axis=1) < 1e-6
+    for first, second in geoms[is_parallel]:
+        yield int(first), int(second)

@@ -5,30 +5,26 @@ guess. Mocap bodies and equality flags never change during an episode, so they n
 on every engine. MJX silently ignores further features; those are refused on its engines.
 """
 
-from typing import NamedTuple
+from collections.abc import Iterator
 
 import mujoco
+import numpy as np
+from jaxtyping import Int, Shaped
 
-from mjx_walk.envs.physics import constraint_settings, elements
+from mjx_walk.envs.physics.elements import constraint_settings, moving_bodies, pairs_that_move
+from mjx_walk.envs.physics.feature_table import EVERY_ENGINE, FeatureTable, Mask, any_of, name_of
+from mjx_walk.envs.physics.jax_features import JAX_FEATURES
 from mjx_walk.utils.errors import UserError, first_line
 
-__all__ = ["refuse_unsupported", "unsupported_by_mjx"]
+__all__ = ["FEATURES", "refuse_unsupported", "unsupported_by_mjx"]
 
-_EVERY = ("warp", "jax", "c")
+FEATURES = FeatureTable()
+"""Features that no engine simulates, or not both MJX engines. Those of `jax` alone are in `JAX_FEATURES`."""
+
 _MJX = ("warp", "jax")
-
-
-class _Feature(NamedTuple):
-    """A feature of a model that some engines do not simulate."""
-
-    engines: tuple[str, ...]
-    """The engines that do not simulate it."""
-    users: elements.Users
-    """The elements of a model that use it."""
-    what: str
-    """The feature, as the subject of a sentence."""
-    advice: str
-    """Change of the model that makes it acceptable."""
+_Flag = mujoco.mjtDisableBit
+_LEAST_PYRAMIDAL_FRICTION = 0.05
+"""With it, velocities after a step differ from C's by at most 1.1e-3, relative to one plus their change."""
 
 
 def refuse_unsupported(model: mujoco.MjModel, engine: str) -> None:
@@ -41,11 +37,11 @@ def refuse_unsupported(model: mujoco.MjModel, engine: str) -> None:
     Raises:
         UserError: it does not; the message names the first element.
     """
-    for feature in _FEATURES:
+    for feature in (*FEATURES, *JAX_FEATURES):
         if engine not in feature.engines:
             continue
         for user in feature.users(model):
-            others = [name for name in reversed(_EVERY) if name not in feature.engines]
+            others = [name for name in reversed(EVERY_ENGINE) if name not in feature.engines]
             also = f", or use physics={others[0]}" if others else ""
             raise UserError(f"physics={engine} does not simulate {feature.what} ({user}); {feature.advice}{also}")
 
@@ -61,180 +57,184 @@ def unsupported_by_mjx(engine: str, error: Exception) -> UserError:
     return UserError(f"physics={engine}: MJX does not support this model: {reason}; use physics=c")
 
 
-_FEATURES = (
-    _Feature(
-        _EVERY,
-        elements.named("actuator", lambda m: m.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE),
-        "actuators with an activation state",
-        'set dyntype="none", or use <motor>, <position> or <velocity> without a time constant',
-    ),
-    _Feature(
-        _EVERY,
-        elements.named("actuator", lambda m: elements.any_of(m.actuator_history)),
-        "actuators with a delay",
-        "remove nsample and delay",
-    ),
-    _Feature(
-        _EVERY,
-        elements.named("sensor", lambda m: elements.any_of(m.sensor_history)),
-        "sensors with a history",
-        "remove nsample, delay and interval",
-    ),
-    _Feature(_EVERY, elements.plugins, "plugins", "remove <extension> and the elements that use it"),
-    _Feature(
-        _EVERY,
-        elements.option('<flag sleep="enable"/>', lambda o: o.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP),
-        "sleeping bodies",
-        "remove the flag",
-    ),
-    _Feature(
-        _MJX,
-        elements.named("actuator", elements.disabled_motors),
-        "disabled actuator groups",
-        "remove actuatorgroupdisable, or the motor",
-    ),
-    _Feature(
-        _MJX,
-        elements.named("actuator", lambda m: elements.any_of(m.actuator_armature)),
-        "actuator armature",
-        "set armature on the joint",
-    ),
-    _Feature(
-        _MJX,
-        elements.named("eq", elements.moving_equalities),
-        "connect and weld constraints as MuJoCo does",
-        "remove the constraint",
-    ),
-    _Feature(
-        _MJX,
-        elements.named("joint", elements.overlapping_joint_limits),
-        "both limits of a joint at the same time",
-        "set a margin below half the range",
-    ),
-    _Feature(
-        _MJX,
-        elements.named("tendon", elements.overlapping_tendon_limits),
-        "both limits of a tendon at the same time",
-        "set a margin below half the range",
-    ),
-    _Feature(
-        _MJX,
-        elements.named("body", elements.balanced_bodies),
-        "contacts of a body whose joints only turn it about its center of mass",
-        "move the body's joint or mass by a fifth of its size",
-    ),
-    _Feature(
-        _MJX,
-        elements.slippery_contacts,
-        f"pyramidal contacts with a friction below {elements.LEAST_PYRAMIDAL_FRICTION}",
-        'set cone="elliptic" in <option>, or condim="1" for contacts without friction',
-    ),
-    _Feature(
-        _MJX,  # Warp's result depends on the order of the contacts, which is arbitrary on a GPU
-        elements.option("noslip_iterations", lambda o: o.noslip_iterations > 0),
-        "the noslip solver as MuJoCo does",
-        "set noslip_iterations to 0 in <option>",
-    ),
-    _Feature(
-        _MJX,
-        elements.named("tendon", elements.unmoved_tendons),
-        "a tendon with limits, friction or an equality that no joint moves in the model's own pose",
-        "remove them",
-    ),
-    _Feature(
-        _MJX,
-        constraint_settings.mixed_solrefs,
-        "a solref of one positive number, for which MuJoCo takes its default",
-        "make both numbers positive or both negative",
-    ),
-    _Feature(
-        _MJX,
-        elements.named("actuator", elements.user_motors),
-        "user gains and biases",
-        "use another gaintype or biastype",
-    ),
-    _Feature(
-        _MJX,
-        elements.named("joint", elements.negative_joints),
-        "negative damping and friction",
-        "set damping and frictionloss to zero or more",
-    ),
-    _Feature(
-        _MJX,
-        elements.named("tendon", elements.negative_tendons),
-        "negative damping and friction",
-        "set damping and frictionloss to zero or more",
-    ),
-    _Feature(
-        ("warp",),
-        elements.named("actuator", elements.motors_limited_twice),
-        "limits of single motors on a tendon that limits their sum",
-        "remove forcerange from the motors, or actuatorfrcrange from the tendon",
-    ),
-    _Feature(
-        ("jax",),
-        elements.named("body", elements.turning_bodies),
-        "contacts of a body whose joints turn it almost about its center of mass",
-        "move the body's joint or mass by a fifth of its size",
-    ),
-    _Feature(
-        ("jax",),
-        constraint_settings.solimps_without_width,
-        "a solimp of width zero as MuJoCo does",
-        "set its third number to more than zero",
-    ),
-    _Feature(
-        ("jax",),
-        elements.named("tendon", elements.side_sites_elsewhere),
-        "a sidesite on another body than its geom",
-        "move the site to the geom's body",
-    ),
-    _Feature(
-        ("jax",),
-        elements.named("actuator", lambda m: elements.any_of(m.actuator_damping, m.actuator_dampingpoly)),
-        "actuator damping",
-        "set damping on the joint",
-    ),
-    _Feature(
-        ("jax",),
-        elements.named("joint", elements.polynomial_joints),
-        "polynomial stiffness and damping",
-        "give the joint one stiffness and one damping",
-    ),
-    _Feature(
-        ("jax",),
-        elements.named("tendon", lambda m: elements.any_of(m.tendon_stiffnesspoly, m.tendon_dampingpoly)),
-        "polynomial stiffness and damping",
-        "give the tendon one stiffness and one damping",
-    ),
-    _Feature(
-        ("jax",),
-        elements.named("tendon", elements.branching_armatures),
-        "the armature of a tendon across branches as MuJoCo does",
-        "remove armature",
-    ),
-    _Feature(
-        ("jax",),
-        elements.named("geom", lambda m: elements.any_of(m.geom_adhesion)),
-        "adhesion",
-        "remove adhesion",
-    ),
-    _Feature(
-        ("jax",),
-        elements.named("pair", lambda m: elements.any_of(m.pair_adhesion)),
-        "adhesion",
-        "remove adhesion",
-    ),
-    _Feature(
-        ("jax",),
-        elements.named("geom", lambda m: elements.any_of(m.geom_surfacevel)),
-        "moving surfaces",
-        "remove surfacevel",
-    ),
-    _Feature(
-        ("jax",),
-        elements.named("geom", elements.fluid_geoms),
-        "the fluid forces of individual geoms",
-        "remove fluidshape and fluidcoef",
-    ),
+@FEATURES.entry(
+    EVERY_ENGINE,
+    "actuator",
+    "actuators with an activation state",
+    'set dyntype="none", or use <motor>, <position> or <velocity> without a time constant',
 )
+def _actuators_with_activation(model: mujoco.MjModel) -> Mask:
+    return model.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE
+
+
+@FEATURES.entry(EVERY_ENGINE, "actuator", "actuators with a delay", "remove nsample and delay")
+def _delayed_actuators(model: mujoco.MjModel) -> Mask:
+    return any_of(model.actuator_history)
+
+
+@FEATURES.entry(EVERY_ENGINE, "sensor", "sensors with a history", "remove nsample, delay and interval")
+def _sensors_with_history(model: mujoco.MjModel) -> Mask:
+    return any_of(model.sensor_history)
+
+
+@FEATURES.entry(EVERY_ENGINE, None, "plugins", "remove <extension> and the elements that use it")
+def _plugins(model: mujoco.MjModel) -> list[str]:
+    return [f"plugin instance {i}" for i in range(model.nplugin)]
+
+
+@FEATURES.entry(EVERY_ENGINE, None, "sleeping bodies", "remove the flag")
+def _sleeping_bodies(model: mujoco.MjModel) -> list[str]:
+    is_enabled = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
+    return ['<flag sleep="enable"/>'] if is_enabled else []
+
+
+@FEATURES.entry(_MJX, "actuator", "disabled actuator groups", "remove actuatorgroupdisable, or the motor")
+def _disabled_motors(model: mujoco.MjModel) -> Mask:
+    """Motors of a group that `actuatorgroupdisable` names. Groups outside 0 to 30 cannot be disabled."""
+    group = model.actuator_group
+    return (group >= 0) & (group <= 30) & (model.opt.disableactuator >> np.clip(group, 0, 30) & 1).astype(bool)
+
+
+@FEATURES.entry(_MJX, "actuator", "actuator armature", "set armature on the joint")
+def _motors_with_armature(model: mujoco.MjModel) -> Mask:
+    return any_of(model.actuator_armature)
+
+
+@FEATURES.entry(_MJX, "eq", "connect and weld constraints as MuJoCo does", "remove the constraint")
+def _moving_equalities(model: mujoco.MjModel) -> Mask:
+    """Active equalities whose Jacobian changes with the position. MuJoCo adds a term for that change, MJX does not."""
+    is_off = model.opt.disableflags & (_Flag.mjDSBL_EQUALITY | _Flag.mjDSBL_CONSTRAINT)
+    is_moving = np.isin(model.eq_type, (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD))
+    return is_moving & model.eq_active0.astype(bool) & (not is_off)
+
+
+@FEATURES.entry(_MJX, "joint", "both limits of a joint at the same time", "set a margin below half the range")
+def _overlapping_joint_limits(model: mujoco.MjModel) -> Mask:
+    """Joints whose upper and lower limit can act at the same time. MJX has one row for both, MuJoCo has two."""
+    is_scalar = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE))
+    return is_scalar & _overlap(model, model.jnt_limited, model.jnt_range, model.jnt_margin)
+
+
+@FEATURES.entry(_MJX, "tendon", "both limits of a tendon at the same time", "set a margin below half the range")
+def _overlapping_tendon_limits(model: mujoco.MjModel) -> Mask:
+    return _overlap(model, model.tendon_limited, model.tendon_range, model.tendon_margin)
+
+
+def _overlap(model: mujoco.MjModel, limited: Mask, limits: Shaped[np.ndarray, "n 2"], margin: Mask) -> Mask:
+    """Whether both limits can act at the same time."""
+    is_on = not model.opt.disableflags & (_Flag.mjDSBL_LIMIT | _Flag.mjDSBL_CONSTRAINT)
+    return (limited != 0) & (limits[:, 1] - limits[:, 0] < 2 * margin) & is_on
+
+
+@FEATURES.entry(
+    _MJX,
+    "body",
+    "contacts of a body whose joints only turn it about its center of mass",
+    "move the body's joint or mass by a fifth of its size",
+)
+def _balanced_bodies(model: mujoco.MjModel) -> Mask:
+    """Moving bodies with contacts whose centre of mass no joint moves. MJX's solver divides by their inertia, zero."""
+    collides = np.zeros(model.nbody, bool)
+    collides[model.geom_bodyid[pairs_that_move(model)[0]]] = True
+    return moving_bodies(model) & collides & (model.body_invweight0[:, 0] < mujoco.mjMINVAL)
+
+
+@FEATURES.entry(
+    _MJX,
+    None,
+    f"pyramidal contacts with a friction below {_LEAST_PYRAMIDAL_FRICTION}",
+    'set cone="elliptic" in <option>, or condim="1" for contacts without friction',
+)
+def _slippery_contacts(model: mujoco.MjModel) -> Iterator[str]:
+    """Pairs of geoms whose pyramidal contacts have little friction.
+
+    A pyramidal contact divides by the square of its friction, and MJX computes in float32.
+    """
+    if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        return
+    geoms, pairs = pairs_that_move(model)
+    condim, friction = _contact_friction(model, geoms, pairs)
+    for both in geoms[(condim > 1) & (friction < _LEAST_PYRAMIDAL_FRICTION)]:
+        yield "geoms " + " and ".join(f"'{model.geom(int(geom)).name or geom}'" for geom in both)
+
+
+def _contact_friction(
+    model: mujoco.MjModel, geoms: Int[np.ndarray, "n 2"], pairs: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " n"], Shaped[np.ndarray, " n"]]:
+    """Dimension and sliding friction of the contacts of pairs of geoms, as C combines them."""
+    priority = model.geom_priority[geoms]
+    is_used = priority == priority.max(axis=1, keepdims=True)
+    condim = np.where(is_used, model.geom_condim[geoms], 0).max(axis=1)
+    friction = np.where(is_used, model.geom_friction[geoms, 0], 0.0).max(axis=1)
+    is_own = pairs >= 0
+    condim[is_own], friction[is_own] = model.pair_dim[pairs[is_own]], model.pair_friction[pairs[is_own], 0]
+    return condim, friction
+
+
+@FEATURES.entry(_MJX, None, "the noslip solver as MuJoCo does", "set noslip_iterations to 0 in <option>")
+def _noslip_solver(model: mujoco.MjModel) -> list[str]:
+    """The noslip solver. Warp's result depends on the order of the contacts, which is arbitrary on a GPU."""
+    return ["noslip_iterations"] if model.opt.noslip_iterations > 0 else []
+
+
+@FEATURES.entry(
+    _MJX,
+    "tendon",
+    "a tendon with limits, friction or an equality that no joint moves in the model's own pose",
+    "remove them",
+)
+def _unmoved_tendons(model: mujoco.MjModel) -> Mask:
+    """Constrained tendons without inertia in the model's own pose. MJX's solver divides by it."""
+    is_constrained = (model.tendon_limited != 0) | (model.tendon_frictionloss > 0)
+    is_tendon = model.eq_type == mujoco.mjtEq.mjEQ_TENDON
+    for tied in (model.eq_obj1id[is_tendon], model.eq_obj2id[is_tendon]):
+        is_constrained[tied[tied >= 0]] = True
+    return is_constrained & (model.tendon_invweight0 < mujoco.mjMINVAL)
+
+
+@FEATURES.entry(
+    _MJX,
+    None,
+    "a solref of one positive number, for which MuJoCo takes its default",
+    "make both numbers positive or both negative",
+)
+def _mixed_solrefs(model: mujoco.MjModel) -> Iterator[str]:
+    """Elements with a `solref` of one positive number. MuJoCo puts its default there, MJX takes the numbers."""
+    for kind, index, solref, _ in constraint_settings(model):
+        if (solref[0] > 0) != (solref[1] > 0):
+            yield name_of(model, kind, index)
+
+
+@FEATURES.entry(_MJX, "actuator", "user gains and biases", "use another gaintype or biastype")
+def _user_motors(model: mujoco.MjModel) -> Mask:
+    """Motors whose force a callback gives. Without one, MuJoCo has a gain of one, MJX of zero."""
+    is_gain = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_USER
+    return is_gain | (model.actuator_biastype == mujoco.mjtBias.mjBIAS_USER)
+
+
+@FEATURES.entry(_MJX, "joint", "negative damping and friction", "set damping and frictionloss to zero or more")
+def _negative_joints(model: mujoco.MjModel) -> Mask:
+    """Joints with negative damping or friction, which MuJoCo accepts."""
+    is_negative = np.zeros(model.njnt, bool)
+    is_negative[model.dof_jntid[(model.dof_damping < 0) | (model.dof_frictionloss < 0)]] = True
+    return is_negative
+
+
+@FEATURES.entry(_MJX, "tendon", "negative damping and friction", "set damping and frictionloss to zero or more")
+def _negative_tendons(model: mujoco.MjModel) -> Mask:
+    return (model.tendon_damping < 0) | (model.tendon_frictionloss < 0)
+
+
+@FEATURES.entry(
+    ("warp",),
+    "actuator",
+    "limits of single motors on a tendon that limits their sum",
+    "remove forcerange from the motors, or actuatorfrcrange from the tendon",
+)
+def _motors_limited_twice(model: mujoco.MjModel) -> Mask:
+    """Motors with a limit on their own force, of several on a tendon that limits their sum."""
+    on_tendon = model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON
+    tendon = np.where(on_tendon, model.actuator_trnid[:, 0], 0)
+    num_motors = np.bincount(tendon[on_tendon], minlength=max(model.ntendon, 1))
+    is_limited = model.tendon_actfrclimited.astype(bool) if model.ntendon else np.zeros(1, bool)
+    return on_tendon & model.actuator_forcelimited.astype(bool) & is_limited[tendon] & (num_motors[tendon] > 1)

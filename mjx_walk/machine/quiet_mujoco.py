@@ -23,17 +23,18 @@ def write_no_log() -> None:
 def hide_deprecations() -> Iterator[None]:
     """Hide MuJoCo's deprecation warnings, and turn its other warnings into Python's.
 
-    MuJoCo prints each warning to stderr. Every load of Gymnasium's HalfCheetah warns of a deprecated attribute, which
-    users cannot change.
+    MuJoCo prints each warning to stderr, and `MjSpec` turns those of its compiler into Python's. Every load of
+    Gymnasium's HalfCheetah warns of a deprecated attribute, which users cannot change.
     """
     previous = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(_warn)
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "(?s).*is deprecated", UserWarning)
+            yield
     finally:
         mujoco.set_mju_user_warning(previous)
 
 
 def _warn(message: str) -> None:
-    if "is deprecated" not in message:
-        warnings.warn(message, stacklevel=2)
+    warnings.warn(message, stacklevel=2)

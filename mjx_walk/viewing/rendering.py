@@ -21,6 +21,8 @@ __all__ = ["choose_opengl", "write_film"]
 _RENDERERS = ("egl", "osmesa", "glfw")
 """Values of `MUJOCO_GL` that Gymnasium renders with; the last one needs a screen."""
 _PROBE = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 64, 64).render()"
+_PROBE_SECONDS = 60.0
+"""Time after which a driver that hangs counts as one that does not render. A slow machine needs a few seconds."""
 
 
 def choose_opengl() -> None:
@@ -54,7 +56,11 @@ def choose_opengl() -> None:
 def _works(name: str) -> bool:
     """Whether MuJoCo renders with a value of `MUJOCO_GL`. A broken driver may crash, so a child process tries it."""
     env = os.environ | {"MUJOCO_GL": name}
-    return not subprocess.run([*python(), "-c", _PROBE], env=env, capture_output=True, check=False).returncode
+    try:
+        command = [*python(), "-c", _PROBE]
+        return not subprocess.run(command, env=env, capture_output=True, timeout=_PROBE_SECONDS, check=False).returncode
+    except subprocess.TimeoutExpired:
+        return False
 
 
 def write_film(frames: list[np.ndarray], path: Path, frames_per_second: float) -> None:

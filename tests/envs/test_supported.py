@@ -300,6 +300,28 @@ def test_contacts_between_bodies_that_cannot_move_are_dropped():
     assert bodies and all(model.body_dofnum[pair].any() for pair in bodies)
 
 
+def test_pairs_of_geoms_are_found_once_per_model(monkeypatch):
+    """In checks, in MJX and in both programs; with hundreds of bodies, each search takes a second."""
+    searched = []
+
+    def search(model):
+        searched.append(type(model))
+        return upstream(model)
+
+    upstream = static_pairs._UPSTREAM
+    monkeypatch.setattr(static_pairs, "_UPSTREAM", search)
+    monkeypatch.setattr(static_pairs, "_known", {})
+    for parts, num_pairs in (({}, 2), ({"shin": 'contype="0" conaffinity="0"'}, 1)):
+        searched.clear()
+        model = load(parts)
+        engine = make_engine("jax", model, 1, ())
+        state = PhysicsState(*(jnp.zeros(size) for size in (model.nq, model.nv, model.nv)))
+        jax.eval_shape(engine.forward, state)
+        jax.eval_shape(engine.step, state, jnp.zeros(model.nu))
+        assert searched == [mujoco.MjModel]
+        assert len([*collision_driver.geom_pairs(model)]) == num_pairs
+
+
 @pytest.mark.parametrize(
     ("flags", "kept"), [((), (True, True)), (("spring",), (False, True)), (("damper",), (True, False))]
 )

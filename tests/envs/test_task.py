@@ -3,6 +3,7 @@
 import copy
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+import warnings
 from pathlib import Path
 
 import gymnasium
@@ -179,7 +180,8 @@ def test_custom_model_file(tmp_path):
 
 def test_loading_models_prints_no_deprecations(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    task = make_env("half_cheetah", physics="c")
+    with warnings.catch_warnings(action="error", category=UserWarning):
+        task = make_env("half_cheetah", physics="c")
     make_gymnasium(task).close()
     printed = capfd.readouterr()
     assert printed.out == printed.err == "" and not list(tmp_path.iterdir())
