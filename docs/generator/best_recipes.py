@@ -8,7 +8,7 @@ from generator.score_tables import highest_published, number, read
 from mjx_walk.experiments.suite import REFERENCES
 
 _ONE_SEED = {
-    "MS": ("csac", "4 or 5 other runs"),
+    "MS": ("csac", "at most 5 other runs"),
     "PT": ("PPO", "1 other run"),
 }
 """Arms of one seed on every task, by the letters of their ids: the algorithm, and what else the GPU trains."""

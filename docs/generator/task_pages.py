@@ -22,7 +22,7 @@ def page(name: str) -> str:
     task, text = tasks["v5"], TEXTS[name]
     parts = [
         f"# {task.GYMNASIUM_NAME}",
-        f"{text.goal} It is Gymnasium's `{task.gymnasium_id}`. Numbers and tables are those of v5.",
+        f"{text.goal} It is Gymnasium's `{task.gymnasium_id}`. Numbers and tables are for v5.",
         *_picture(name, text),
         f"```\npython -m mjx_walk.train env={name}\n```",
         *_shipped_policies(name),
