@@ -122,8 +122,8 @@ TEXTS = {
             "reward_survive": "`healthy_reward` if the hopper is healthy",
         },
         termination="When the hopper is not healthy, unless `terminate_when_unhealthy=false`. It is healthy while the "
-        "height of its root is inside `healthy_z_range` and the angle of its torso inside `healthy_angle_range`. All angles "
-        "and velocities must also be inside `healthy_state_range`.",
+        "height of its root is inside `healthy_z_range` and the angle of its torso inside `healthy_angle_range`. All "
+        "angles and velocities must also be inside `healthy_state_range`.",
         v4=(_PAID_AT_THE_END.format(term="reward_survive"),),
     ),
     "swimmer": TaskText(
@@ -134,8 +134,8 @@ TEXTS = {
     ),
     "reacher": TaskText(
         goal="A two-joint arm in a plane moves its fingertip to a target.",
-        start="with joint angles uniform in ±0.1 rad and joint velocities uniform in ±0.005 rad/s. The target is uniform "
-        "in a disc with a radius of 0.2 m",
+        start="with joint angles uniform in ±0.1 rad and joint velocities uniform in ±0.005 rad/s. The target is "
+        "uniform in a disc with a radius of 0.2 m",
         rewards={
             "reward_dist": "−`reward_dist_weight` × distance from fingertip to target, m",
             "reward_ctrl": "−`reward_control_weight` × sum of the squared actions",
@@ -148,8 +148,8 @@ TEXTS = {
     ),
     "pusher": TaskText(
         goal="A seven-joint arm pushes a cylinder to a goal.",
-        start="with joint velocities uniform in ±0.005 rad/s. The object is uniform in a rectangle of 0.3 m × 0.4 m, at "
-        "least 0.17 m from the goal",
+        start="with joint velocities uniform in ±0.005 rad/s. The object is uniform in a rectangle of 0.3 m × 0.4 m, "
+        "at least 0.17 m from the goal",
         rewards={
             "reward_dist": "−`reward_dist_weight` × distance from object to goal, m",
             "reward_ctrl": "−`reward_control_weight` × sum of the squared actions",

@@ -2,8 +2,8 @@
 
 import copy
 import pickle
-from concurrent.futures import ThreadPoolExecutor
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import gymnasium
