@@ -35,6 +35,7 @@ from mjx_walk.settings.overrides import complete_overrides, key_of_value
 from mjx_walk.settings.own_hydra import own_hydra
 from mjx_walk.settings.recipe_files import with_stored_recipes
 from mjx_walk.settings.renamed import present_overrides
+from mjx_walk.settings.value_sources import as_yaml_with_sources
 from mjx_walk.storage.files import user_path
 from mjx_walk.storage.run_folder import RunFolder, new_folder
 from mjx_walk.training import launcher
@@ -60,7 +61,7 @@ usage: python -m mjx_walk.train [env=humanoid] [algo=ppo] [KEY=VALUE ...]
   env.KEY=VALUE                           set one of Gymnasium's keywords, or env.version=v4
   algo.KEY=VALUE                          set an algorithm's setting
   -m seed=0,1,2                           run a Hydra sweep; Hydra's launchers work
-  --cfg job                               print the configuration and exit
+  --cfg job                               print the configuration, with the source of each value, and exit
   algo=NAME --help                        also list the settings of the algorithm, with ranges and meanings
 """
 
@@ -174,6 +175,11 @@ def _through_hydra(arguments: list[str]) -> None:
     _check_cfg(arguments)
     given = [a for a in arguments if not a.startswith("-") and ("=" in a or a.startswith(("+", "~")))]
     flags = [argument for argument in arguments if argument not in given]
+    if flags in (["--cfg", "job"], ["-c", "job"], ["--cfg=job"], ["-c=job"]):
+        given = present_overrides(given)
+        load_config(given)  # reports errors in one line
+        print(as_yaml_with_sources(given), end="")
+        return
     overrides = complete_overrides(given, is_sweep=bool({"-m", "--multirun"} & {*flags}))
     parsed = OverridesParser.create().parse_overrides(overrides)
     for override in parsed:

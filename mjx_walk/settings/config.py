@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from typing import cast
 
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
@@ -16,7 +15,7 @@ from mjx_walk.settings.own_hydra import own_hydra
 from mjx_walk.settings.recipe_files import with_paths, with_stored_recipes
 from mjx_walk.settings.recipes import CONFIG_DIR, recipe_names
 from mjx_walk.settings.renamed import present_overrides
-from mjx_walk.settings.schema import CheckpointConfig, Config
+from mjx_walk.settings.schema import CheckpointConfig, Config, leaves
 from mjx_walk.storage.files import user_path, working_folder
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import has_effect, refuse_ineffective, validate
@@ -104,16 +103,7 @@ def with_absolute_paths(config: Config, folder: Path) -> Config:
 
 def flatten(config: Config) -> dict[str, object]:
     """All settings by their full keys, with values as in `config.yaml`."""
-
-    def walk(value: dict[str, object], prefix: str):
-        for key, item in value.items():
-            if isinstance(item, dict):
-                yield from walk(item, f"{prefix}{key}.")
-            else:
-                yield prefix + key, item
-
-    settings = cast(dict[str, object], OmegaConf.to_container(OmegaConf.structured(config)))
-    return dict(walk(settings, ""))
+    return dict(leaves(OmegaConf.to_container(OmegaConf.structured(config))))
 
 
 def training_command(config: Config) -> str:

@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.settings.recipes import CONFIG_DIR, HARDWARE, fallback, has_file
+from mjx_walk.settings.schema import leaves
 from mjx_walk.storage.files import read_bytes, user_path, working_folder
 from mjx_walk.utils.errors import UserError, first_line
 
@@ -199,14 +200,6 @@ def recipe_settings(path: Path) -> Iterator[tuple[Path, str, Any]]:
             yield from recipe_settings(file)
         elif isinstance(entry, dict):
             yield from ((path, f"/{key.rpartition('/')[2]}", value) for key, value in entry.items())
-    for key, value in _flat(OmegaConf.to_container(node), ""):
+    for key, value in leaves(OmegaConf.to_container(node)):
         if key != "defaults":
             yield path, key, value
-
-
-def _flat(values: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-    for key, value in values.items():
-        if isinstance(value, dict) and value:
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value

@@ -11,7 +11,7 @@ from mjx_walk.envs import TASKS
 from mjx_walk.envs.physics import ENGINES
 from mjx_walk.utils.setting_fields import MAX_SEED, Dataclass, setting
 
-__all__ = ["CheckpointConfig", "Config", "chosen", "setting_types"]
+__all__ = ["CheckpointConfig", "Config", "chosen", "leaves", "setting_types"]
 
 
 @dataclasses.dataclass
@@ -59,6 +59,20 @@ class Config:
     """Precision of the networks' matrix products. The physics always uses float32."""
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
+
+
+def leaves(values: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of nested dictionaries, by their full keys.
+
+    Args:
+        values: dictionary with strings as keys.
+        prefix: start of the full keys, such as `algo.`.
+    """
+    for key, value in values.items():
+        if isinstance(value, dict) and value:
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def chosen(overrides: list[str]) -> tuple[str, str]:
