@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_walk.envs.inline_evaluation import InlineEvaluation, InlineEvaluator
 from mjx_walk.envs.state import MAX_ABS_VALUE, State
 from mjx_walk.envs.task import Task
 from mjx_walk.utils.errors import UserError
@@ -48,22 +47,18 @@ class Outcome(NamedTuple):
 
 
 class VectorEnv:
-    """`num_envs` environments that train and those of the inline evaluation, stepped in one physics call."""
+    """`num_envs` environments that train. Others, which it does not reset, join their physics calls."""
 
-    def __init__(
-        self, task: Task, num_envs: int, evaluator: InlineEvaluator, init_at_random_episode_step: bool = False
-    ):
+    def __init__(self, task: Task, num_envs: int, init_at_random_episode_step: bool = False):
         """
         Args:
             task: the unbatched environment.
             num_envs: number of environments that train, B.
-            evaluator: its environments, at most B, join the batch.
             init_at_random_episode_step: start the first episodes at random step counts, so that time limits do not
                 end all episodes at once. The episode metrics leave out these first, shorter episodes.
         """
         self.task = task
         self.num_envs = num_envs
-        self.evaluator = evaluator
         self.init_at_random_episode_step = init_at_random_episode_step
 
     def init(self, key: jax.Array) -> VectorState:
@@ -93,21 +88,22 @@ class VectorEnv:
         return jax.vmap(self.task.reset)(jax.random.split(key, self.num_envs))
 
     def step(
-        self, state: VectorState, evaluation: InlineEvaluation, action: jax.Array
-    ) -> tuple[VectorState, InlineEvaluation, Outcome, Metrics]:
-        """Step every environment, and reset those whose episode ends.
+        self, state: VectorState, action: jax.Array, others: State, others_action: jax.Array
+    ) -> tuple[VectorState, State, Outcome, Metrics]:
+        """Step every environment, and reset those that train and whose episode ends.
 
         Args:
             state: the environments that train.
-            evaluation: the inline evaluation, stepped with them.
             action: `[B, action_size] f32`, in Gymnasium's units.
+            others: `[E, …]`: environments that are stepped in the same physics call.
+            others_action: `[E, action_size] f32`, in Gymnasium's units.
 
         Returns:
-            The next state, in which no episode has ended; the next evaluation; the outcome before the resets; and
+            The next state, in which no episode has ended; the other environments; the outcome before the resets; and
             metrics that may be summed over steps: `episodes`, then over the episodes that ended `return`, `length` and
             each reward term; `nonfinite`, `overflow`, `resets` and `resets_reused`.
         """
-        env, evaluation = self._step_all(state, evaluation, action)
+        env, others = self._step_all(state.env, action, others, others_action)
         done = env.terminated | env.truncated
         sums = EpisodeSums(
             state.sums.reward + env.reward,
@@ -139,18 +135,14 @@ class VectorEnv:
         )
         metrics = {name: Metric(value, Reduction.SUM) for name, value in counts.items()}
         metrics |= {name: Metric(value, Reduction.PER_EPISODE) for name, value in episode_sums.items()}
-        return next_state, evaluation, Outcome(env.obs, env.reward, env.terminated, env.truncated), metrics
+        return next_state, others, Outcome(env.obs, env.reward, env.terminated, env.truncated), metrics
 
-    def _step_all(
-        self, state: VectorState, evaluation: InlineEvaluation, action: jax.Array
-    ) -> tuple[State, InlineEvaluation]:
-        """One physics call for the environments that train and those that are evaluated."""
-        envs = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), state.env, evaluation.env)
-        actions = jnp.concatenate([action, self.evaluator.act(evaluation)])
-        envs = jax.vmap(self.task.step)(envs, actions)
+    def _step_all(self, env: State, action: jax.Array, others: State, others_action: jax.Array) -> tuple[State, State]:
+        """One physics call for the environments that train and the others."""
+        envs = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), env, others)
+        envs = jax.vmap(self.task.step)(envs, jnp.concatenate([action, others_action]))
         trained = jax.tree.map(lambda x: x[: self.num_envs], envs)
-        evaluated = jax.tree.map(lambda x: x[self.num_envs :], envs)
-        return trained, self.evaluator.record(evaluation, evaluated)
+        return trained, jax.tree.map(lambda x: x[self.num_envs :], envs)
 
 
 def check_resets(state: VectorState) -> None:

@@ -2,8 +2,8 @@
 
 from generator.markdown import code, table
 from mjx_walk.algos import ALGORITHMS
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.envs import TASKS
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.reward_shaping import Shaping
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.settings.config import CheckpointConfig, Config

@@ -16,8 +16,8 @@ from mjx_walk.algos.ppo import PPO, PPOConfig
 from mjx_walk.algos.reinforce import REINFORCE, REINFORCEConfig
 from mjx_walk.algos.sac import SAC, SACConfig
 from mjx_walk.algos.td3 import TD3, TD3Config
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.envs import Task
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.class_checks import check_class, check_decorated
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import with_name

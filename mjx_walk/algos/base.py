@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, PRNGKeyArray
 
+from mjx_walk.common.inline_evaluation import EvaluationConfig, InlineEvaluation, InlineEvaluator
 from mjx_walk.envs import Task
-from mjx_walk.envs.inline_evaluation import EvaluationConfig, InlineEvaluation, InlineEvaluator
 from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.envs.vector_env import VectorEnv, VectorState
 from mjx_walk.utils.types import (
@@ -102,7 +102,7 @@ class Algorithm(abc.ABC, Generic[_StateT, _BatchT, _ConfigT]):
         # Configurations are mutable, and the hash would not change with them.
         self._set(config=copy.deepcopy(self.config), evaluation=copy.deepcopy(self.evaluation))
         evaluator = InlineEvaluator(self.task, self.num_envs, self.evaluation, self.policy, self.steps_per_iteration)
-        env = VectorEnv(self.task, self.num_envs, evaluator, self.config.init_at_random_episode_step)
+        env = VectorEnv(self.task, self.num_envs, self.config.init_at_random_episode_step)
         self._set(evaluator=evaluator, env=env)
 
     def _set(self, **constants: object) -> None:

@@ -160,7 +160,9 @@ class OffPolicyAlgorithm(
         noise_keys = jax.vmap(jax.random.fold_in, (None, 0))(state.noise_key, step // config.noise_repeat)
         env, evaluation, scores = self.start_iteration(state, pool_key)
         actor = functools.partial(self._explore, state)
-        env, evaluation, steps, metrics = rollout.unroll(self.env, env, evaluation, actor, noise_keys, _keep)
+        env, evaluation, steps, metrics = rollout.unroll(
+            self.env, self.evaluator, env, evaluation, actor, noise_keys, _keep
+        )
         return state.replace(env=env, evaluation=evaluation, key=key), (steps, metrics | scores)
 
     def _explore(

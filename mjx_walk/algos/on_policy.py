@@ -135,7 +135,9 @@ class OnPolicyAlgorithm(Algorithm[OnPolicyState, OnPolicyBatch, _OnPolicyConfigT
             env, evaluation, exploration = carry
             exploration, noise, key = self.exploration.unroll(exploration, key, config.unroll_length)
             inputs = (jax.random.split(key, config.unroll_length), noise)
-            env, evaluation, kept, metrics = rollout.unroll(self.env, env, evaluation, actor, inputs, keep)
+            env, evaluation, kept, metrics = rollout.unroll(
+                self.env, self.evaluator, env, evaluation, actor, inputs, keep
+            )
             return (env, evaluation, exploration), (*kept, env.env.obs, metrics)
 
         env, evaluation, scores = self.start_iteration(state, pool_key)

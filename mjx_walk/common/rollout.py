@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int32, PRNGKeyArray
 
+from mjx_walk.common.inline_evaluation import InlineEvaluation, InlineEvaluator
 from mjx_walk.envs import TrainableTask
-from mjx_walk.envs.inline_evaluation import InlineEvaluation
 from mjx_walk.envs.vector_env import Outcome, VectorEnv, VectorState
 from mjx_walk.utils.types import Metrics, PolicyFn, PyTree
 
@@ -35,6 +35,7 @@ class Step(NamedTuple):
 
 def unroll(
     env: VectorEnv,
+    evaluator: InlineEvaluator,
     state: VectorState,
     evaluation: InlineEvaluation,
     actor: Actor[_InputsT, _ExtrasT],
@@ -44,9 +45,10 @@ def unroll(
     """Step all environments T times.
 
     Args:
-        env: the environments.
+        env: the environments that train.
+        evaluator: steps the inline evaluation with them.
         state: their state.
-        evaluation: the inline evaluation, stepped with them.
+        evaluation: state of the inline evaluation.
         actor: chooses actions.
         inputs: `[T]` random keys, or a tree of `[T, …]`, for the actor.
         keep: what of each step to store; whatever it drops takes no memory.
@@ -59,7 +61,7 @@ def unroll(
         state, evaluation = carry
         obs = state.env.obs
         action, extras = actor(obs, step_inputs)
-        state, evaluation, outcome, metrics = env.step(state, evaluation, action)
+        state, evaluation, outcome, metrics = evaluator.step(env, state, evaluation, action)
         return (state, evaluation), (keep(Step(obs, action, outcome, extras)), metrics)
 
     (state, evaluation), (kept, metrics) = jax.lax.scan(one, (state, evaluation), inputs)

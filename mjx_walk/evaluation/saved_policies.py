@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_walk.algos import Algorithm, TrainState, make_algorithm, without_replay
+from mjx_walk.common.inline_evaluation import NO_RETURN
 from mjx_walk.envs import TASKS, Task
-from mjx_walk.envs.inline_evaluation import NO_RETURN
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.machine.compat import standard_settings
 from mjx_walk.settings.config import Config

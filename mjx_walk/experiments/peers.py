@@ -13,8 +13,8 @@ from brax.training.agents.sac import networks as sac_networks
 from brax.training.agents.sac import train as sac
 
 from mjx_walk.algos.sac import SAC, SACConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.envs import State, TaskOptions, TrainableTask
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.experiments.timing import Measurement
 from mjx_walk.training.programs import make_init, make_step

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from mjx_walk.algos import ALGORITHMS
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.envs import TASKS
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.physics import ENGINES
 from mjx_walk.utils.setting_fields import MAX_SEED, Dataclass, setting
 

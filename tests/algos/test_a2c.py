@@ -11,7 +11,7 @@ from mjx_walk.algos.a2c import A2C, A2CConfig
 from mjx_walk.algos.policy_gradient import out_of_bounds, policy_gradient_loss, sampled_kl
 from mjx_walk.common import networks
 from mjx_walk.common.exploration import OrnsteinUhlenbeck
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.errors import UserError
 
 NUM_ENVS, STEPS = 16, 6

@@ -7,7 +7,7 @@ from helpers import small_settings
 from toy_tasks import EndlessReward
 
 from mjx_walk.algos import ALGORITHMS, is_finite, learned_leaves, make_algorithm
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 
 PARTS = {
     **dict.fromkeys(("ppo", "a2c"), ("params.policy", "params.value", "optimizer", "learning_rate")),

@@ -8,7 +8,7 @@ import toy_tasks
 
 from mjx_walk.algos.csac import CSAC, CSACConfig, project
 from mjx_walk.algos.off_policy_state import Batch
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import Transition
 

@@ -12,7 +12,7 @@ from toy_tasks import EndlessReward, ToyTask
 
 from mjx_walk.algos.off_policy import OffPolicyAlgorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 
 NUM_ENVS = 4
 

@@ -17,8 +17,8 @@ from mjx_walk.algos.on_policy import _make_optimizer
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.algos.ppo import PPO, PPOConfig
 from mjx_walk.common import networks, returns
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.envs import make_env
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.experiments.peers import restore_device_put_replicated
 
 SMALL = PPOConfig(

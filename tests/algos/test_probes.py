@@ -13,7 +13,7 @@ from helpers import OPTIMIZED, slow_except
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.common import networks
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.training.programs import make_init, make_step
 
 # A vmapped call cannot reuse its input's memory.

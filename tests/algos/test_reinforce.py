@@ -9,7 +9,7 @@ from toy_tasks import DelayedReward, EndlessReward
 
 from mjx_walk.algos.reinforce import REINFORCE, REINFORCEConfig, linear_fit
 from mjx_walk.common import networks
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 
 NUM_ENVS, STEPS, LEARNED = 16, 6, 4
 # The tail beyond the unroll has discount 0.5³ at the fourth step and 0.5² at the fifth.

@@ -13,9 +13,9 @@ from toy_tasks import BraxSizes, ToyTask
 
 from mjx_walk.algos.off_policy_state import Batch
 from mjx_walk.algos.sac import SAC, SACConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.common.replay_buffer import ReplayBuffer
 from mjx_walk.envs import make_env
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.experiments.peers import restore_device_put_replicated
 from mjx_walk.utils.types import Transition
 

@@ -10,7 +10,7 @@ from toy_tasks import ToyTask
 from mjx_walk.algos.ddpg import DDPG, DDPGConfig
 from mjx_walk.algos.off_policy_state import Batch
 from mjx_walk.algos.td3 import TD3, TD3Config
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.types import Transition
 
 LINEAR = {

@@ -17,7 +17,7 @@ from jax.interpreters import partial_eval
 from toy_tasks import EndlessReward
 
 from mjx_walk.algos import ALGORITHMS, make_algorithm
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.utils.setting_fields import has_effect
 
 CHANGES = {

@@ -11,8 +11,8 @@ from helpers import unregistered
 import mjx_walk
 from mjx_walk.algos import ALGORITHMS, PPO, PPOConfig, make_algorithm
 from mjx_walk.algos.base import Algorithm
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.envs import TASKS, Task, TaskOptions, make_env, registry
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.settings.recipes import fallback
 from mjx_walk.utils.errors import UserError

@@ -15,7 +15,7 @@ from mjx_walk.algos import make_algorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
 from mjx_walk.algos.ppo import PPO, PPOConfig
 from mjx_walk.common import networks, returns
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.evaluation.saved_policies import make_task
 from mjx_walk.logs.metrics import read_rows
 from mjx_walk.settings.config import load_config

@@ -9,7 +9,7 @@ import pytest
 from toy_tasks import ObservedReward
 
 from mjx_walk.algos.ppo import PPO, PPOConfig
-from mjx_walk.envs.inline_evaluation import EvaluationConfig
+from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.programs import DevicesProgram, SeedsProgram, SingleProgram
 from mjx_walk.utils.collectives import DEVICES

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_walk.envs.state import State
-from mjx_walk.envs.task import Task
+from mjx_walk.envs import State, Task
+from mjx_walk.envs.vector_env import Outcome, VectorEnv, VectorState
 from mjx_walk.utils.setting_fields import setting
 from mjx_walk.utils.types import ITERATION_COUNT, Metric, Metrics, PolicyFn, PolicyParams, Reduction
 
@@ -102,18 +102,23 @@ class InlineEvaluator:
             best_return=jnp.float32(NO_RETURN),
         )
 
-    def act(self, evaluation: InlineEvaluation) -> jax.Array:
-        """Actions of the snapshot, `[E, action_size]`, in Gymnasium's units."""
-        return self._policy(evaluation.policy_params)(evaluation.env.obs, jax.random.PRNGKey(0))
+    def step(
+        self, env: VectorEnv, state: VectorState, evaluation: InlineEvaluation, action: jax.Array
+    ) -> tuple[VectorState, InlineEvaluation, Outcome, Metrics]:
+        """Step the environments that train and those of the round in one physics call.
 
-    def record(self, evaluation: InlineEvaluation, env: State) -> InlineEvaluation:
-        """Add the rewards of one step. Environments whose episode has ended are stepped, but not recorded."""
-        return evaluation.replace(
-            env=env,
-            returns=evaluation.returns + jnp.where(evaluation.alive, env.reward, 0.0),
-            lengths=evaluation.lengths + evaluation.alive,
-            alive=evaluation.alive & ~(env.terminated | env.truncated),
-        )
+        Args:
+            env: the environments that train.
+            state: their state.
+            evaluation: the present round, whose environments the snapshot controls.
+            action: `[B, action_size] f32` of the environments that train, in Gymnasium's units.
+
+        Returns:
+            The next state; the next evaluation; and outcome and metrics of `VectorEnv.step`.
+        """
+        own_action = self._policy(evaluation.policy_params)(evaluation.env.obs, jax.random.PRNGKey(0))
+        state, own, outcome, metrics = env.step(state, action, evaluation.env, own_action)
+        return state, _record(evaluation, own), outcome, metrics
 
     def next_round(
         self, evaluation: InlineEvaluation, policy_params: PolicyParams, iteration: jax.Array, starts: State
@@ -149,3 +154,13 @@ class InlineEvaluator:
         )
         present = present.replace(best_policy_params=params, best_iteration=best_iteration, best_return=best_return)
         return present, {name: Metric(value, Reduction.FIRST_DEVICE).only_if(is_over) for name, value in scores.items()}
+
+
+def _record(evaluation: InlineEvaluation, env: State) -> InlineEvaluation:
+    """Add the rewards of one step. Environments whose episode has ended are stepped, but not recorded."""
+    return evaluation.replace(
+        env=env,
+        returns=evaluation.returns + jnp.where(evaluation.alive, env.reward, 0.0),
+        lengths=evaluation.lengths + evaluation.alive,
+        alive=evaluation.alive & ~(env.terminated | env.truncated),
+    )
