@@ -166,7 +166,7 @@ class Recorders:
 
     def begin(self, env_steps: int, will_train: bool, restored: list[Metadata]) -> None:
         """Open the logs, as `Recorder.begin` does. `restored` is empty if no run resumes."""
-        for recorder, metadata in zip(self._recorders, restored or [{}] * len(self._recorders), strict=True):
+        for recorder, metadata in zip(self._recorders, restored or [Metadata()] * len(self._recorders), strict=True):
             recorder.begin(env_steps, will_train, metadata)
 
     def write(self, rows: list[Row]) -> None:
