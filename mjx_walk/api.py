@@ -12,7 +12,7 @@ from pathlib import Path
 import yaml
 
 from mjx_walk import zoo
-from mjx_walk.algos import make_algorithm
+from mjx_walk.algos import Algorithm, make_algorithm
 from mjx_walk.cli.parsing import refuse_flags
 from mjx_walk.envs import BUILT_IN_TASKS, Task, register_task
 from mjx_walk.envs.physics import resolve_engine
@@ -36,11 +36,9 @@ from mjx_walk.settings.trust import remember
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.saved_yaml import read_yaml
 from mjx_walk.storage.scores import BEST, Scores
-from mjx_walk.training.announcement import announce
-from mjx_walk.training.distributed import Processes
-from mjx_walk.training.folder_checks import prepared
-from mjx_walk.training.memory_check import check_replay
-from mjx_walk.training.resuming import as_saved
+from mjx_walk.training.checks import as_saved, check_replay, prepared
+from mjx_walk.training.distributed import Processes, per_device
+from mjx_walk.training.messages import announce
 from mjx_walk.training.trainer import Trainer
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import validate
@@ -188,8 +186,9 @@ def train(
         closing.callback(task.engine.preparation.cancel)
         if task.reward_hashes and processes.is_main_process:
             remember(configs[0].env.reward_function, task.reward_hashes)
-        folders, configs = _prepare(configs, task, processes, closing, runs)
-        trainer = Trainer(configs, task, folders, on_metrics, processes)
+        algorithm = _make_algorithm(configs[0], task, processes)
+        folders, configs = _prepare(configs, algorithm, processes, closing, runs)
+        trainer = Trainer(configs, algorithm, folders, on_metrics, processes)
         with as_by_ctrl_c(), contextlib.closing(trainer):
             signal_name = trainer.train()
             if not signal_name:
@@ -199,14 +198,19 @@ def train(
     return folders, signal_name
 
 
+def _make_algorithm(config: Config, task: Task, processes: Processes) -> Algorithm:
+    """The algorithm of a run on this process's device."""
+    evaluation, algo = (per_device(own, processes.process_count) for own in (config.evaluation, config.algo))
+    return make_algorithm(task, config.num_envs, evaluation, algo, processes.axis_name)
+
+
 def _prepare(
-    configs: list[Config], task: Task, processes: Processes, closing: contextlib.ExitStack, runs: Path
+    configs: list[Config], algorithm: Algorithm, processes: Processes, closing: contextlib.ExitStack, runs: Path
 ) -> tuple[list[RunFolder], list[Config]]:
     """Check that the runs fit this machine, and prepare their folders. All processes get the main one's folder.
 
     The main process locks the folders until `closing` is closed.
     """
-    algorithm = make_algorithm(task, configs[0].num_envs, configs[0].evaluation, configs[0].algo)
     replay = check_replay(algorithm, Path(configs[0].run_dir or "."), len(configs))
     folders: list[RunFolder] = []
     if processes.is_main_process:

@@ -10,7 +10,7 @@ from mjx_walk.evaluation.saved_policies import default_policy, kept_policies
 from mjx_walk.settings.own_tasks import take_task
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import POLICIES, Scores, read_scores, write_scores
-from mjx_walk.training.summary import choice_line, score_lines
+from mjx_walk.training.messages import choice_line, score_lines
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import MAX_SEED, setting
 

@@ -9,7 +9,7 @@ from mjx_walk.evaluation.saved_policies import kept_policies
 from mjx_walk.settings.own_tasks import take_task
 from mjx_walk.storage.files import replacing, user_path
 from mjx_walk.storage.scores import BEST, POLICIES
-from mjx_walk.training.summary import choice_line
+from mjx_walk.training.messages import choice_line
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
 

@@ -19,7 +19,7 @@ def shared_programs():
     """Within it, trainings in one process share what earlier ones have compiled. It must not change traced code."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("mjx_walk.api.make_task", _task)
-        patched.setattr("mjx_walk.training.trainer.make_algorithm", _algorithm)
+        patched.setattr("mjx_walk.api.make_algorithm", _algorithm)
         patched.setattr("mjx_walk.training.trainer.make_program", _program)
         yield
 

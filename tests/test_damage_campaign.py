@@ -17,9 +17,10 @@ from mjx_walk.settings.saved_config import MAY_DIFFER, differences
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import POLICIES, read_scores
+from mjx_walk.training.checks import prepared
 from mjx_walk.training.distributed import Processes
-from mjx_walk.training.folder_checks import prepared
 from mjx_walk.training.recorder import Recorder
+from mjx_walk.training.restoring import restore_newest
 from mjx_walk.utils.errors import UserError
 
 RUNS = {"ppo": (*TINY, "env.max_episode_steps=8"), "sac": (*TINY_OFF_POLICY, "algo=sac")}
@@ -51,9 +52,9 @@ class Examiner:
         config = self.resolve(run_dir)
         found += differences(self.config, config, [key for key in MAY_DIFFER if key != "total_steps"])
         with prepared([config]) as (folders, _):
-            recorder = Recorder(config, self.task, self.algorithm, folders[0], Processes())
-            state, metadata = recorder.restore(self.like)
-            recorder.begin(metadata["env_steps"], will_train=False)
+            recorder = Recorder(config, self.algorithm, folders[0], Processes())
+            state, metadata = restore_newest(folders[0].checkpoints, self.like, Processes())
+            recorder.begin(metadata["env_steps"], will_train=False, restored=metadata)
             recorder.close()
         found += [] if metadata["env_steps"] == max(self.states) else ["an older checkpoint"]
         found += [] if _same(state, self.states[metadata["env_steps"]]) else ["another state"]

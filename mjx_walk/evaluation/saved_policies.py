@@ -31,6 +31,7 @@ __all__ = [
     "default_policy",
     "deterministic_act",
     "deterministic_policy",
+    "in_float32",
     "kept_policies",
     "load_policy",
     "make_acting_algorithm",
@@ -118,6 +119,13 @@ def make_acting_algorithm(task: Task, config: Config) -> Algorithm:
     """The algorithm of a configuration, in float32: a policy then acts alike on every machine."""
     algo = dataclasses.replace(config.algo, network_dtype="float32")
     return make_algorithm(task, config.num_envs, config.evaluation, algo)
+
+
+def in_float32(algorithm: Algorithm) -> Algorithm:
+    """The algorithm itself if its networks are in float32; otherwise one that acts as `make_acting_algorithm`'s."""
+    if algorithm.config.network_dtype == "float32":
+        return algorithm
+    return dataclasses.replace(algorithm, config=dataclasses.replace(algorithm.config, network_dtype="float32"))
 
 
 def deterministic_act(algorithm: Algorithm, policy_params: PolicyParams) -> Act:

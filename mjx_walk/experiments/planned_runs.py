@@ -28,7 +28,7 @@ from mjx_walk.storage import checkpoint
 from mjx_walk.storage.files import check_replaceable, open_to_append, refuse_links, user_path
 from mjx_walk.storage.locks import locked
 from mjx_walk.storage.run_folder import RunFolder
-from mjx_walk.training.folder_checks import locked_folder
+from mjx_walk.training.checks import locked_folder
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.text import format_score
 

@@ -1,5 +1,6 @@
-"""The progress of a training and of a scoring: a bar in a terminal, else log messages."""
+"""The speed of a training, and the progress of a training and of a scoring: a bar in a terminal, else log messages."""
 
+import collections
 import logging
 import math
 import shutil
@@ -12,16 +13,42 @@ from tqdm import tqdm
 from mjx_walk.logs.metrics import Row
 from mjx_walk.utils.text import duration, format_score
 
-__all__ = ["Progress", "ScoringProgress"]
+__all__ = ["Progress", "ScoringProgress", "Speed"]
 
 _LOGGER = logging.getLogger("mjx_walk.progress")
 _SECONDS_BETWEEN_LINES = 10.0
 """Interval of the log messages."""
+_SECONDS_OF_SPEED = 10.0
+"""Seconds over which the speed is averaged."""
 _BAR = "{desc}{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}{speed}{postfix}"
 _MOST_IN_DIGITS = 1_000
 """Largest total of a bar that writes its numbers without a unit prefix: 150, not 0.15k."""
 _COLUMNS_FOR_LENGTH = 100
 """Width of a terminal from which on the bar also shows the length of the episodes."""
+
+
+class Speed:
+    """Calls per second over about `_SECONDS_OF_SPEED` seconds, including evaluation and saving."""
+
+    def __init__(self, call: int):
+        """
+        Args:
+            call: number of calls before the first one that is timed.
+        """
+        self._times = collections.deque([(time.monotonic(), call)])
+        self._has_compiled = False
+
+    def after(self, call: int) -> float:
+        """The speed at the end of a call."""
+        now = time.monotonic()
+        while len(self._times) > 1 and now - self._times[1][0] > _SECONDS_OF_SPEED:
+            self._times.popleft()
+        then, call_then = self._times[0]
+        if not self._has_compiled:
+            self._times.clear()  # the speeds of later calls leave compiling out
+            self._has_compiled = True
+        self._times.append((now, call))
+        return (call - call_then) / max(now - then, 1e-9)
 
 
 class _Bar(tqdm):

@@ -1,40 +1,38 @@
 """The host loop: call the compiled program, log, save, and score at the end."""
 
-import functools
 import logging
 import signal
 import time
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from mjx_walk.algos import Algorithm, TrainState, learned_leaves, make_algorithm, without_replay
-from mjx_walk.common.rollout import evaluate
-from mjx_walk.envs import Task
+from mjx_walk.algos import Algorithm, TrainState, learned_leaves, without_replay
 from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.envs.vector_env import check_resets
+from mjx_walk.evaluation.saved_policies import in_float32
 from mjx_walk.logs.metrics import Row, mean_row, name_metrics, physics_warnings
-from mjx_walk.logs.progress import Progress
-from mjx_walk.machine.signals import Interrupt, postponed, undisturbed
+from mjx_walk.logs.progress import Progress, Speed
+from mjx_walk.machine.signals import Interrupt, postponed
 from mjx_walk.settings.config import Config
+from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.storage.run_folder import RunFolder
+from mjx_walk.storage.scores import BEST, FINAL
 from mjx_walk.training.call_profile import CallProfile
-from mjx_walk.training.distributed import Processes, per_device
+from mjx_walk.training.distributed import Processes
+from mjx_walk.training.messages import end_lines, score_lines
 from mjx_walk.training.programs import compile_together, make_program
-from mjx_walk.training.recorders import Recorders
-from mjx_walk.training.speed import Speed
-from mjx_walk.training.summary import end_lines
+from mjx_walk.training.recorder import Recorders, reporting_failed_writes
+from mjx_walk.training.restoring import restore_runs
+from mjx_walk.training.scoring import Policies, final_and_best, score_run
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import Metrics
+from mjx_walk.viewing.film import Filmer
 
 __all__ = ["Trainer"]
 
 _LOGGER = logging.getLogger(__name__)
-
-_CLOSING_EVALUATION = 2**31 - 1
-"""Folded into a run's seed, so that the evaluation at the end has its own episodes."""
 
 
 class Trainer:
@@ -43,7 +41,7 @@ class Trainer:
     def __init__(
         self,
         configs: list[Config],
-        task: Task,
+        algorithm: Algorithm,
         folders: list[RunFolder],
         on_metrics: Callable[[Row], None] | None = None,
         processes: Processes | None = None,
@@ -51,27 +49,27 @@ class Trainer:
         """
         Args:
             configs: checked configurations that differ only in `seed` and `run_dir`.
-            task: the unbatched environment.
+            algorithm: algorithm of one run, on one device.
             folders: prepared run folders, one for each configuration.
             on_metrics: called with every logged row.
             processes: processes that train one run together, with `num_envs` environments each.
         """
         self._config = config = configs[0]
-        self._task = task
+        self._algorithm = algorithm
         self._folders = folders
         self._processes = processes = processes or Processes()
-        count = processes.process_count
-        evaluation, algo = per_device(config.evaluation, count), per_device(config.algo, count)
-        self._algorithm = make_algorithm(task, config.num_envs, evaluation, algo, axis_name=processes.axis_name)
-        self._program = make_program(self._algorithm, config.iterations_per_call, len(configs), processes)
-        self._recorders = Recorders(configs, task, self._algorithm, folders, processes)
-        self._steps_per_iteration = self._algorithm.steps_per_iteration * count
+        self._program = make_program(algorithm, config.iterations_per_call, len(configs), processes)
+        self._recorders = Recorders(configs, algorithm, folders, processes)
+        films = config.evaluation.films and processes.is_main_process
+        self._filmers = [Filmer(*run) for run in zip(configs, folders, strict=True)] if films else []
+        self._steps_per_iteration = algorithm.steps_per_iteration * processes.process_count
         self._steps_per_call = self._steps_per_iteration * config.iterations_per_call
         self._num_calls = -(-config.total_steps // self._steps_per_call)
         self._seeds = [own.seed for own in configs]
         self._keys = [jax.random.PRNGKey(seed) for seed in self._seeds]
-        self._evaluate = jax.jit(functools.partial(_returns, self._algorithm))
         self._on_metrics = on_metrics or (lambda row: None)
+        self._policies: list[Policies] = []
+        """Policies of each run after a complete training, in the main process."""
         self._started = time.monotonic()
         self._seconds_before = 0.0
         self._warned_of: set[str] = set()
@@ -85,12 +83,13 @@ class Trainer:
         Raises:
             UserError: training has diverged, so that a network, an optimizer or a running statistic is not finite.
         """
-        restored, call = self._restored()
+        restored, metadata = self._restored()
+        call = metadata[0]["env_steps"] // self._steps_per_call if metadata else 0
         self._say_total(call)
         progress = self._make_progress(call)
         state = self._ready_to_call(restored, call)
         speed = Speed(call)
-        self._recorders.begin(call * self._steps_per_call, will_train=call < self._num_calls)
+        self._recorders.begin(call * self._steps_per_call, call < self._num_calls, metadata)
         saved_call, is_finite = call or -1, True
         with Interrupt() as interrupt, self._make_profile() as profile:
             signal_name = self._stop_signal(interrupt)
@@ -98,7 +97,11 @@ class Trainer:
                 profile.next_call()
                 state, metrics = self._program.step(state)
                 call += 1
-                self._log(state, self._rows(call, metrics, speed), progress)
+                rows = self._rows(call, metrics, speed)
+                self._recorders.write(rows)
+                self._report(rows)
+                self._film(state, rows)
+                progress.update(mean_row(rows))
                 is_finite = bool(self._program.is_finite(state).all())
                 if call % self._config.checkpoint.every_calls == 0:
                     self._save(state, call, progress)
@@ -107,12 +110,7 @@ class Trainer:
             if saved_call != call:
                 self._save(state, call, progress)
         progress.close()
-        is_complete = is_finite and not signal_name
-        self._recorders.end(
-            self._program.split(without_replay(state)),
-            call * self._steps_per_call,
-            self._mean_return if is_complete else None,
-        )
+        self._finish(state, call, is_complete=is_finite and not signal_name)
         if not is_finite:
             raise UserError(self._divergence(state, call))
         return signal_name
@@ -123,13 +121,17 @@ class Trainer:
         On return or error, all saves are complete.
         """
         seconds = self._seconds()
-        num_episodes = self._config.evaluation.gymnasium_episodes
+        task, num_episodes = self._algorithm.task, self._config.evaluation.gymnasium_episodes
         is_main = self._processes.is_main_process
         if num_episodes and is_main:
-            where = "Gymnasium, on the CPU" if self._task.is_in_gymnasium else f"physics={self._task.engine.name}"
+            where = "Gymnasium, on the CPU" if task.is_in_gymnasium else f"physics={task.engine.name}"
             episodes = "episode" if num_episodes == 1 else "episodes"
             _LOGGER.info("Scoring %d %s of each policy in %s", num_episodes, episodes, where)
-        self._recorders.score(seconds, self._num_calls * self._steps_per_call)
+        try:
+            if num_episodes and self._policies:
+                self._score_runs(num_episodes, seconds)
+        finally:
+            self._wait_for_files()
         paths = [folder.path for folder in self._folders]
         for line in end_lines(paths, seconds, self._seconds(), bool(num_episodes)) if is_main else ():
             _LOGGER.info(line)
@@ -139,14 +141,13 @@ class Trainer:
         with postponed("finishing the checkpoint"):
             self._recorders.close()
 
-    def _restored(self) -> tuple[TrainState | None, int]:
-        """The saved TrainState, if there is one, and the number of completed calls."""
-        restored = self._recorders.restore() if self._config.resume else []
+    def _restored(self) -> tuple[TrainState | None, list[Metadata]]:
+        """The saved TrainState and the metadata of each run, if they are saved."""
+        restored = restore_runs(self._folders, self._algorithm, self._processes) if self._config.resume else []
         if not restored:
-            return None, 0
+            return None, []
         self._seconds_before = max(metadata["wall_seconds"] for _, metadata in restored)
-        calls = restored[0][1]["env_steps"] // self._steps_per_call
-        return self._program.merge([state for state, _ in restored]), calls
+        return self._program.merge([state for state, _ in restored]), [metadata for _, metadata in restored]
 
     def _say_total(self, call: int) -> None:
         """Log whether the run is finished already, and the steps that it really trains."""
@@ -172,9 +173,9 @@ class Trainer:
             return restored
         with nothing_runs():
             programs = self._program.lower(self._keys, restored)
-        self._task.engine.preparation.begin()  # not before, since it would slow the tracing down
+        self._algorithm.task.engine.preparation.begin()  # not before, since it would slow the tracing down
         compile_together(programs)
-        self._task.engine.preparation.wait()
+        self._algorithm.task.engine.preparation.wait()
         if restored is not None:
             return restored
         state = self._program.init(self._keys)
@@ -196,34 +197,72 @@ class Trainer:
         }
         return [common | name_metrics(own, self._steps_per_iteration) | speeds for own in metrics]
 
-    def _log(self, state: TrainState, rows: list[Row], progress: Progress) -> None:
-        """Log and display the rows of a call. Film the policies whose evaluation has ended."""
-        self._recorders.write(rows)
+    def _report(self, rows: list[Row]) -> None:
+        """Warn of physics that failed, and hand the rows to the caller."""
         for row in rows:
-            self._warn_of_physics(row)
+            for metric, warning in physics_warnings(row, self._steps_per_call).items():
+                if metric not in self._warned_of:
+                    self._warned_of.add(metric)
+                    _LOGGER.warning(f"{warning}; the metric {metric} has the count")
             self._on_metrics(row)
-        if self._config.evaluation.films and any("eval/return" in row for row in rows):
-            self._recorders.film(self._program.split(self._algorithm.policy_params(state)), rows)
-        progress.update(mean_row(rows))
 
-    def _warn_of_physics(self, row: Row) -> None:
-        for metric, warning in physics_warnings(row, self._steps_per_call).items():
-            if metric not in self._warned_of:
-                self._warned_of.add(metric)
-                _LOGGER.warning(f"{warning}; the metric {metric} has the count")
+    def _film(self, state: TrainState, rows: list[Row]) -> None:
+        """Film the policies of the runs whose inline evaluation has ended, if the configuration asks for it."""
+        if not self._filmers or not any("eval/return" in row for row in rows):
+            return
+        policies = self._program.split(self._algorithm.policy_params(state))
+        for filmer, folder, policy, row in zip(self._filmers, self._folders, policies, rows, strict=True):
+            if "eval/return" in row:
+                with reporting_failed_writes(folder):
+                    filmer.take(policy, int(row["env_steps"]))
 
     def _save(self, state: TrainState, call: int, progress: Progress) -> None:
         """Save the TrainState of every run that is finite."""
         progress.show_stage("saving")
-        self._recorders.wait_for_saves()
+        self._recorders.wait()
+        self._processes.wait_for_all()
         states, are_finite = self._program.split(state), self._program.is_finite(state)
         self._recorders.save(states, are_finite, call * self._steps_per_call, self._seconds())
 
-    def _mean_return(self, seed: int, policy_params: Any) -> float:
-        """Mean return of a policy over as many new episodes as an inline evaluation has."""
-        key = jax.random.fold_in(jax.random.PRNGKey(seed), _CLOSING_EVALUATION)
-        with undisturbed("finishing the evaluation of the final policy"):
-            return float(self._evaluate(policy_params, key))
+    def _finish(self, state: TrainState, call: int, is_complete: bool) -> None:
+        """Close the logs and draw the curves. After a complete training, choose the best policy of each run."""
+        self._recorders.close_logs()
+        states = self._program.split(without_replay(state))
+        if self._processes.is_main_process:
+            self._draw_curves()
+        if self._processes.is_main_process and is_complete:
+            env_steps = call * self._steps_per_call
+            self._policies = final_and_best(self._algorithm, states, self._seeds, env_steps, self._steps_per_iteration)
+            self._recorders.save_best([own[BEST] if own[BEST] is own[FINAL] else None for own in self._policies])
+        if is_complete and len(self._folders) * self._processes.process_count == 1:
+            return  # a single folder is saved while the policies are scored
+        self._wait_for_files()
+        self._processes.wait_for_all()
+        self._recorders.prune()
+
+    def _draw_curves(self) -> None:
+        from mjx_walk.viewing.run_plots import plot_run  # imports Matplotlib, which slows the start
+
+        for folder in self._folders:
+            try:
+                plot_run(folder)
+            except (OSError, UserError) as error:
+                _LOGGER.warning(f"cannot draw the curves of {folder.path}: {error}; draw them with mjx_walk.plots")
+
+    def _score_runs(self, num_episodes: int, training_seconds: float) -> None:
+        """Score the policies of each run, and log their scores."""
+        acting = in_float32(self._algorithm)
+        total_steps = self._num_calls * self._steps_per_call
+        for seed, folder, policies in zip(self._seeds, self._folders, self._policies, strict=True):
+            scored = score_run(acting, policies, folder, num_episodes, training_seconds)
+            for line in score_lines(scored, total_steps, seed if len(self._seeds) > 1 else None):
+                _LOGGER.info(line)
+
+    def _wait_for_files(self) -> None:
+        """Wait until all checkpoints and films are on disk."""
+        self._recorders.wait()
+        for filmer in self._filmers:
+            filmer.wait()
 
     def _divergence(self, state: TrainState, call: int) -> str:
         """Name the runs that have diverged, each with its first learned leaf that is not finite."""
@@ -238,9 +277,3 @@ class Trainer:
 
     def _seconds(self) -> float:
         return self._seconds_before + time.monotonic() - self._started
-
-
-def _returns(algorithm: Algorithm, policy_params: Any, key: jax.Array) -> jax.Array:
-    """Mean return of a policy in as many environments as the inline evaluation has."""
-    returns, _ = evaluate(algorithm.task, algorithm.evaluator.num_envs, algorithm.policy(policy_params), key)
-    return returns.mean()

@@ -22,7 +22,7 @@ from mjx_walk.machine import compat
 from mjx_walk.settings import trust
 from mjx_walk.settings.config import load_config
 from mjx_walk.storage import files, run_folder
-from mjx_walk.training.folder_checks import prepared
+from mjx_walk.training.checks import prepared
 from mjx_walk.utils.errors import UserError
 
 

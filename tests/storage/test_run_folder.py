@@ -15,7 +15,7 @@ from mjx_walk.storage import checkpoint
 from mjx_walk.storage.background_saver import BackgroundSaver, Part
 from mjx_walk.storage.checkpoint_metadata import read_metadata, write_metadata
 from mjx_walk.storage.run_folder import RunFolder, open_existing
-from mjx_walk.training.folder_checks import prepared
+from mjx_walk.training.checks import prepared
 from mjx_walk.utils.errors import UserError
 
 

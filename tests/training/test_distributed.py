@@ -21,8 +21,8 @@ from mjx_walk.logs.metrics import read_rows
 from mjx_walk.settings.config import load_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.training.distributed import Processes, in_place, init_on_device, per_device
-from mjx_walk.training.distributed_checkpoint import restore_newest
 from mjx_walk.training.programs import make_init
+from mjx_walk.training.restoring import restore_newest
 from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import leaves_with

@@ -1,6 +1,5 @@
 """Which policies a run keeps and scores."""
 
-import dataclasses
 import shutil
 
 import jax
@@ -14,8 +13,10 @@ from mjx_walk.settings.config import load_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.run_folder import RunFolder, open_existing
 from mjx_walk.storage.scores import Scores, read_scores
+from mjx_walk.training import scoring
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.recorder import Recorder
+from mjx_walk.training.restoring import restore_newest
 from mjx_walk.utils.errors import UserError
 
 TINY = [
@@ -34,7 +35,7 @@ def run(tmp_path):
     folder = RunFolder(tmp_path)
     folder.checkpoints.mkdir()
     state = jax.jit(algorithm.init)(jax.random.PRNGKey(0))
-    return Recorder(config, task, algorithm, folder, Processes()), algorithm, state, folder
+    return Recorder(config, algorithm, folder, Processes()), algorithm, state, folder
 
 
 def with_best(algorithm, state, best_return, best_iteration):
@@ -91,9 +92,15 @@ def test_a_folder_without_a_final_policy_says_so(run):
         choose_policy(folder, "last")
 
 
+def end(algorithm, state, final_return, monkeypatch):
+    """The policies of a run whose training ends with a state, and whose last evaluation gives `final_return`."""
+    monkeypatch.setattr(scoring, "evaluate", lambda task, num, policy, key: (jnp.full(num, final_return), None))
+    return scoring.final_and_best(algorithm, [state], seeds=[0], env_steps=80, steps_per_iteration=4)[0]
+
+
 @pytest.mark.parametrize(("final", "best"), [(5.0, 9.0), (9.0, 5.0)])
 def test_both_policies_are_scored_and_the_scores_choose_nothing(run, monkeypatch, final, best):
-    recorder, algorithm, state, folder = run
+    _, algorithm, state, folder = run
     state, best_params = with_best(algorithm, state, best_return=10.0, best_iteration=5)
     acted = {}
 
@@ -102,11 +109,9 @@ def test_both_policies_are_scored_and_the_scores_choose_nothing(run, monkeypatch
         value = final if len(acted) == 1 else best
         return Scores(np.full(num_episodes, value), np.full(num_episodes, 3), [0], task.gymnasium_id)
 
-    monkeypatch.setattr("mjx_walk.training.recorder.score_in_gymnasium", score)
-    monkeypatch.setattr("mjx_walk.viewing.run_plots.plot_run", lambda folder: None)
-    recorder.begin(0, will_train=True)
-    recorder.end(state, env_steps=80, evaluate=lambda params: 9.5)  # less than the best one's 10
-    scored = recorder.score(wall_seconds=1.0)
+    monkeypatch.setattr(scoring, "score_in_gymnasium", score)
+    policies = end(algorithm, state, 9.5, monkeypatch)  # less than the best one's 10
+    scored = scoring.score_run(algorithm, policies, folder, num_episodes=1, training_seconds=1.0)
     assert {name: (scores.mean, steps) for name, (scores, steps) in scored.items()} == {
         "final": (final, 80),
         "best": (best, 20),
@@ -131,12 +136,11 @@ def test_a_final_policy_with_the_highest_evaluation_is_also_the_best(run, monkey
         scored_policies.append(act)
         return Scores(np.full(num_episodes, 4.0), np.full(num_episodes, 3), [0], task.gymnasium_id)
 
-    monkeypatch.setattr("mjx_walk.training.recorder.score_in_gymnasium", score)
-    monkeypatch.setattr("mjx_walk.viewing.run_plots.plot_run", lambda folder: None)
-    recorder.begin(0, will_train=True)
+    monkeypatch.setattr(scoring, "score_in_gymnasium", score)
+    policies = end(algorithm, state, 10.5, monkeypatch)
     recorder.save(state, env_steps=80, wall_seconds=1.0)
-    recorder.end(state, env_steps=80, evaluate=lambda params: 10.5)
-    recorder.score(wall_seconds=1.0)
+    recorder.save_best(*policies["best"])
+    scoring.score_run(algorithm, policies, folder, num_episodes=1, training_seconds=1.0)
     recorder.wait()
     params, metadata = kept(folder, "best", algorithm, state)
     assert_same(params, algorithm.policy_params(state))
@@ -151,8 +155,8 @@ def test_the_next_save_of_a_resumed_run_keeps_what_its_state_holds_as_the_best(r
     recorder.save(state, env_steps=80, wall_seconds=1.0)
     recorder.wait()
     checkpoint.save(folder.policy("best"), algorithm.policy_params(state), {"env_steps": 80, "eval_return": 10.5})
-    resumed = Recorder(recorder.config, make_task(recorder.config), algorithm, folder, Processes())
-    restored, _ = resumed.restore(state)
+    resumed = Recorder(load_config(TINY), algorithm, folder, Processes())
+    restored, _ = restore_newest(folder.checkpoints, state, Processes())
     resumed.save(restored, env_steps=84, wall_seconds=2.0)
     resumed.wait()
     params, metadata = kept(folder, "best", algorithm, state)
@@ -162,10 +166,8 @@ def test_the_next_save_of_a_resumed_run_keeps_what_its_state_holds_as_the_best(r
 
 @pytest.mark.parametrize(("seeds", "kept_steps"), [(1, [8]), (2, [4, 8])])
 def test_seeds_that_train_together_keep_a_checkpoint_that_all_of_them_have(run, seeds, kept_steps):
-    recorder, algorithm, state, folder = run
-    keep_one = dataclasses.replace(recorder.config.checkpoint, max_to_keep=1)
-    config = dataclasses.replace(recorder.config, checkpoint=keep_one)
-    recorder = Recorder(config, make_task(config), algorithm, folder, Processes(), seeds)
+    _, algorithm, state, folder = run
+    recorder = Recorder(load_config([*TINY, "checkpoint.max_to_keep=1"]), algorithm, folder, Processes(), seeds)
     for env_steps in (4, 8):
         recorder.save(state, env_steps, wall_seconds=1.0)
     recorder.wait()

@@ -32,7 +32,7 @@ from shared_programs import shared_programs
 from mjx_walk.api import resolve
 from mjx_walk.machine.subprocesses import start_module
 from mjx_walk.storage import checkpoint
-from mjx_walk.training import trainer
+from mjx_walk.training import scoring
 
 TASK = {"c": "env=walker2d", "jax": "env=inverted_pendulum", "warp": "env=walker2d"}
 """Without contacts, the `jax` engine compiles in a fraction of the time."""
@@ -243,7 +243,7 @@ def sigterm(*_):
 @pytest.mark.parametrize(("end", "code", "shown"), [(ctrl_c, 130, "Ctrl-C"), (sigterm, 143, "SIGTERM")])
 @pytest.mark.slow
 def test_a_signal_while_a_policy_is_scored_says_how_to_score_it(tmp_path, monkeypatch, capsys, end, code, shown):
-    monkeypatch.setattr("mjx_walk.training.recorder.score_in_gymnasium", end)
+    monkeypatch.setattr("mjx_walk.training.scoring.score_in_gymnasium", end)
     full = (*TINY, "evaluation.gymnasium_episodes=2", f"total_steps={TINY_CALL}", f"run_dir={tmp_path / 'run'}")
     assert command_here("train", *full) == code
     said = capsys.readouterr()
@@ -261,8 +261,8 @@ def test_the_final_evaluation_ends_before_a_signal_takes_effect(tmp_path, monkey
         ended.append(True)
         return real(*arguments)
 
-    real = trainer.evaluate
-    monkeypatch.setattr(trainer, "evaluate", evaluate)
+    real = scoring.evaluate
+    monkeypatch.setattr(scoring, "evaluate", evaluate)
     assert command_here("train", *TINY, f"run_dir={tmp_path / 'run'}", f"total_steps={TINY_CALL}") == 143
     said = capsys.readouterr().err
     assert ended and said.endswith("SIGTERM: finishing the evaluation of the final policy\nStopped by SIGTERM.\n")

@@ -12,8 +12,9 @@ from mjx_walk.settings.config import load_config
 from mjx_walk.settings.saved_config import save_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.run_folder import RunFolder
-from mjx_walk.training import recorders
-from mjx_walk.training.recorders import have_saved, restore_together
+from mjx_walk.training import restoring
+from mjx_walk.training.distributed import Processes
+from mjx_walk.training.restoring import have_saved, restore_together
 from mjx_walk.utils.errors import UnreadableError, UserError
 
 SEEDS = "seeds=[3,5]"
@@ -80,17 +81,19 @@ def test_seeds_side_by_side_resume_exactly_and_each_may_go_on_alone(tmp_path, ca
 
 
 class Saved:
-    """A recorder with checkpoints at some steps."""
+    """A run with checkpoints at some steps, in place of their folder."""
 
     def __init__(self, steps, seeds_together):
         self.steps, self.metadata = steps, {"seeds_together": seeds_together}
 
-    def restore(self, like, at_most=10**9):
+    def restore(self, like, processes, at_most=10**9):
         return like, self.metadata | {"env_steps": max((step for step in self.steps if step <= at_most), default=0)}
 
 
 def restored_steps(*runs):
-    return [metadata["env_steps"] for _, metadata in restore_together(runs, None)]
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(restoring, "restore_newest", Saved.restore)
+        return [metadata["env_steps"] for _, metadata in restore_together(runs, None, Processes())]
 
 
 def test_seeds_that_a_kill_has_parted_go_back_to_the_step_of_all():
@@ -120,7 +123,7 @@ def test_seeds_of_which_one_cannot_be_read_now_neither_begin_again_nor_part(tmp_
         raise UnreadableError(f"cannot read {path}")
 
     (tmp_path / "1" / "checkpoints" / f"{10:013d}").mkdir(parents=True)
-    monkeypatch.setattr(recorders, "read_meta", fail)
+    monkeypatch.setattr(checkpoint, "read_meta", fail)
     with pytest.raises(UnreadableError, match="cannot read"):
         have_saved([RunFolder(tmp_path / name) for name in ("1", "2")])
 

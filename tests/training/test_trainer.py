@@ -12,13 +12,14 @@ from jax._src import compiler
 from shared_programs import shared_programs
 
 import mjx_walk
+from mjx_walk import envs
 from mjx_walk import train as train_command
-from mjx_walk.algos import make_algorithm
+from mjx_walk.algos import Algorithm, make_algorithm
 from mjx_walk.evaluation.saved_policies import make_task
 from mjx_walk.settings.config import load_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.training import programs
-from mjx_walk.training.folder_checks import prepared
+from mjx_walk.training.checks import prepared
 from mjx_walk.training.programs import make_init, make_step
 from mjx_walk.utils.errors import UserError
 
@@ -72,6 +73,27 @@ def test_each_program_is_compiled_once(seeds, tmp_path, monkeypatch):
         train_command.main([*TINY, seeds, f"run_dir={tmp_path / 'run'}", steps, f"resume={resume}"])
     counts = [[names.count(f"jit_{name}") for name in ("_strong_init", "collect", "learn")] for names in compiled]
     assert counts == [[1, 1, 1], [0, 1, 1]]
+
+
+@pytest.mark.parametrize("dtype", slow_except(["float32"], ["float32", "bfloat16"]))
+def test_a_command_builds_one_task_one_engine_and_one_algorithm(tmp_path, monkeypatch, dtype):
+    """Policies are scored in float32. A second algorithm does that if the networks learn in another precision."""
+    built = []
+
+    def count(place, name):
+        real = getattr(place, name)
+        monkeypatch.setattr(
+            place, name, lambda *arguments, **options: built.append(name) or real(*arguments, **options)
+        )
+
+    count(envs.task, "make_engine")
+    count(envs.Task, "__init__")
+    count(Algorithm, "__post_init__")
+    overrides = ["evaluation.gymnasium_episodes=1", f"algo.network_dtype={dtype}", f"total_steps={TINY_CALL}"]
+    train_command.main([*TINY, *overrides, f"run_dir={tmp_path}/run"])
+    assert (tmp_path / "run" / "eval_gymnasium.json").exists()
+    counts = [built.count(name) for name in ("make_engine", "__init__", "__post_init__")]
+    assert counts == [1, 1, 1 if dtype == "float32" else 2]
 
 
 def test_a_call_is_logged_before_the_next_begins(tmp_path, monkeypatch):

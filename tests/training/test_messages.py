@@ -6,7 +6,7 @@ import pytest
 
 from mjx_walk.settings.config import load_config
 from mjx_walk.storage.run_folder import RunFolder
-from mjx_walk.training.announcement import announce
+from mjx_walk.training.messages import announce
 
 
 @pytest.mark.parametrize(("calls", "devices", "warns"), [(1, 1, False), (2, 1, True), (2, 2, False)])

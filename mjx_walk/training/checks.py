@@ -1,21 +1,106 @@
-"""The checks of a run folder before a training writes into it, and its lock."""
+"""The checks before a training: what a resumed run may change, memory, disk space, and the run folder with its lock."""
 
 import contextlib
 import dataclasses
+import operator
+import shlex
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from mjx_walk.algos import Algorithm
+from mjx_walk.envs.user_files import only_known, source_path
+from mjx_walk.machine.devices import device_memory, num_bytes
 from mjx_walk.settings.config import Config
-from mjx_walk.settings.saved_config import differences, in_short, name_same_file, read_saved_config, save_config
+from mjx_walk.settings.input_files import check_inputs
+from mjx_walk.settings.renamed import present_key
+from mjx_walk.settings.saved_config import (
+    differences,
+    in_short,
+    name_same_file,
+    read_saved_config,
+    save_config,
+    with_setting,
+)
+from mjx_walk.settings.trust import require_trusted
 from mjx_walk.storage.checkpoint import list_steps
 from mjx_walk.storage.files import is_unfinished, refuse_links, sync
 from mjx_walk.storage.locks import locked
 from mjx_walk.storage.run_folder import RunFolder, new_folder, open_existing
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["locked_folder", "prepared"]
+__all__ = ["as_saved", "check_replay", "locked_folder", "prepared"]
 
 _CANNOT_WRITE = "cannot write to run_dir={}: {}"
+_USABLE = 0.9
+"""Maximum fraction of the device's memory for the replay buffer."""
+
+
+def as_saved(config: Config, overrides: list[str]) -> Config:
+    """The saved configuration with the given settings, if a run is resumed without naming its task or algorithm.
+
+    Raises:
+        UserError: a file that the run reads has changed; or the saved run has a reward function that neither the
+            overrides name nor the user has named before, or logs to Weights & Biases, and the overrides do not say so.
+            A folder must not run code or upload.
+    """
+    if config.env.reward_function:
+        only_known(source_path(config.env.reward_function), None)
+    given = {present_key(override.partition("=")[0]) for override in overrides}
+    if not (config.resume and config.run_dir):
+        return config
+    if given & {"env", "algo", "recipe"}:
+        check_inputs(RunFolder(Path(config.run_dir)), config.env, config.env)
+        return config
+    folder = open_existing(config.run_dir)
+    saved = read_saved_config(folder)
+    source = saved.env.reward_function
+    if source and "env.reward_function" not in given:
+        require_trusted(source)
+    check_inputs(folder, saved.env, config.env)
+    project = saved.wandb_project
+    if project and "wandb_project" not in given:
+        named = shlex.quote(f"wandb_project={project}")
+        raise UserError(f"the saved run logs to Weights & Biases; to go on, add {named}, or wandb_project=null")
+    for key in given - {"hardware"} | {"run_dir", "resume"}:
+        saved = with_setting(saved, key, operator.attrgetter(key)(config))
+    return saved
+
+
+def check_replay(algorithm: Algorithm, run_dir: Path, num_runs: int = 1) -> str | None:
+    """Memory and disk space that the replay buffer needs, as a line to print.
+
+    Args:
+        algorithm: the algorithm, with its replay size.
+        run_dir: run folder; it need not exist.
+        num_runs: number of seeds in one process.
+
+    Returns:
+        One line, or None if the algorithm has no replay buffer.
+
+    Raises:
+        UserError: the replay buffer or its checkpoints do not fit.
+    """
+    if not algorithm.replay_bytes:
+        return None
+    replay_bytes = num_runs * algorithm.replay_bytes
+    checkpoint_bytes = num_runs * num_bytes(algorithm.state_shapes())
+    replay, disk = f"{replay_bytes / 1e9:,.2f} GB", f"{2 * checkpoint_bytes / 1e9:,.2f} GB"
+    memory = device_memory()
+    if replay_bytes > _USABLE * memory:
+        fewer = " or train fewer seeds in one process (compare: together=1)" if num_runs > 1 else ""
+        raise UserError(
+            f"the replay buffer needs {replay}, but the device has {memory / 1e9:,.2f} GB; "
+            f"lower algo.replay_capacity{fewer}"
+        )
+    existing = next(path for path in (run_dir.absolute(), *run_dir.absolute().parents) if path.exists())
+    free = shutil.disk_usage(existing).free
+    if 2 * checkpoint_bytes > free:
+        raise UserError(
+            f"checkpoints with the replay buffer need {disk} of disk space, but {existing} has "
+            f"{free / 1e9:,.2f} GB free; lower algo.replay_capacity or choose another run_dir"
+        )
+    return f"Replay buffer: {replay} of device memory, and up to {disk} of disk space while a checkpoint is replaced."
 
 
 @contextlib.contextmanager

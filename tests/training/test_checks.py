@@ -7,7 +7,7 @@ import pytest
 
 from mjx_walk.settings.config import load_config
 from mjx_walk.storage import checkpoint
-from mjx_walk.training.folder_checks import prepared
+from mjx_walk.training.checks import prepared
 from mjx_walk.utils.errors import UserError
 
 
