@@ -15,9 +15,9 @@ from mjx_walk.envs.state import State
 from mjx_walk.envs.task import Task
 from mjx_walk.utils.setting_fields import setting
 
-__all__ = ["NUM_ROOT_DOFS", "HumanoidBody", "HumanoidBodyOptions"]
+__all__ = ["HumanoidBody", "HumanoidBodyOptions"]
 
-NUM_ROOT_DOFS = 6
+_NUM_ROOT_DOFS = 6
 """Degrees of freedom of the root's free joint, which has no motor."""
 
 
@@ -73,7 +73,7 @@ class HumanoidBody(Body):
         """First observed row of an array. v5 skips the world body and the root joint, v4 includes them."""
         if self.options.version == "v4":
             return 0
-        return NUM_ROOT_DOFS if name == "qfrc_actuator" else 1
+        return _NUM_ROOT_DOFS if name == "qfrc_actuator" else 1
 
     def observation_blocks(self) -> dict[str, int]:
         blank = mujoco.MjData(self.model)
