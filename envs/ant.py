@@ -6,21 +6,20 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from mjx_walk.envs.body import Body, BodyOptions, HealthOptions, HealthyBody
 from mjx_walk.envs.info import Info, plane_position, plane_velocity
 from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState, with_normal_velocity
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.state import Carry, State
-from mjx_walk.envs.task import Task
-from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.setting_fields import setting
 
 __all__ = ["Ant", "AntOptions"]
 
 
 @dataclasses.dataclass
-class AntOptions(TaskOptions):
+class AntOptions(BodyOptions, HealthOptions):
     """Keyword arguments of Gymnasium's `AntEnv`."""
 
     name: str = setting("ant", choices=("ant",))
@@ -50,7 +49,7 @@ class AntOptions(TaskOptions):
     """Observe the contact forces on each body."""
 
 
-class Ant(Task):
+class Ant(HealthyBody, Body):
     """Ant, which runs forward and must stay upright.
 
     Source: `gymnasium/envs/mujoco/ant_v5.py` and `ant_v4.py`.
@@ -68,10 +67,6 @@ class Ant(Task):
     MODEL_NEEDS = ModelNeeds(positions=3)
 
     options: AntOptions
-
-    @property
-    def terminates_on_fall(self) -> bool:
-        return self.options.terminate_when_unhealthy
 
     @property
     def gymnasium_reward_terms(self) -> tuple[str, ...]:
@@ -96,9 +91,8 @@ class Ant(Task):
         return ("xpos", "cfrc_ext") if self._has_contact_cost else ("xpos",)
 
     def observation_blocks(self) -> dict[str, int]:
-        skipped = 2 * self.options.exclude_current_positions_from_observation
-        blocks = {"qpos": self.model.nq - skipped, "qvel": self.model.nv}
-        return blocks | ({"cfrc_ext": 6 * (self.model.nbody - self._first_body)} if self._observes_forces else {})
+        forces = {"cfrc_ext": 6 * (self.model.nbody - self._first_body)} if self._observes_forces else {}
+        return super().observation_blocks() | forces
 
     @property
     def _first_body(self) -> int:
@@ -110,9 +104,8 @@ class Ant(Task):
 
         It holds positions without x and y (13), velocities (14) and, in v5, clipped contact forces (78).
         """
-        qpos = physics.qpos[2:] if self.options.exclude_current_positions_from_observation else physics.qpos
         forces = [self._contact_forces(derived)[self._first_body :].ravel()] if self._observes_forces else []
-        return jnp.concatenate([qpos, physics.qvel, *forces])
+        return jnp.concatenate([super().observe(physics, derived), *forces])
 
     def _contact_forces(self, derived: Derived) -> Float[Array, "nbody 6"]:
         return jnp.clip(derived["cfrc_ext"], *self.options.contact_force_range)
@@ -127,14 +120,12 @@ class Ant(Task):
     ) -> tuple[Terms, Float[Array, ""], Bool[Array, ""]]:
         options = self.options
         low, high = options.healthy_z_range
-        is_healthy = (low <= physics.qpos[2]) & (physics.qpos[2] <= high)
-        # v4 also pays the healthy reward in the step that terminates the episode.
-        is_paid = is_healthy | (options.terminate_when_unhealthy and options.version == "v4")
+        survive, terminated = self.survival((low <= physics.qpos[2]) & (physics.qpos[2] <= high))
         velocity = (carry["main_body"][0] - before.memory["main_body"][0]) / self.dt
         terms = {
             "reward_forward": options.forward_reward_weight * velocity,
             "reward_ctrl": -options.ctrl_cost_weight * jnp.square(action).sum(),
-            "reward_survive": options.healthy_reward * is_paid,
+            "reward_survive": survive,
         }
         if self._has_contact_cost:
             contact = -options.contact_cost_weight * jnp.square(self._contact_forces(derived)).sum()
@@ -143,7 +134,7 @@ class Ant(Task):
             else:
                 # As in Gymnasium, v4's `reward_ctrl` is then the contact cost; the control cost gets a name of ours.
                 terms |= {"reward_ctrl": contact, "reward_quadctrl": terms["reward_ctrl"]}
-        return terms, sum(terms.values(), jnp.float32(0.0)), ~is_healthy & options.terminate_when_unhealthy
+        return terms, sum(terms.values(), jnp.float32(0.0)), terminated
 
     def position_info(self, state: State) -> Info:
         """The root's position in v5, and the torso's in v4, which is that of the last forward pass."""

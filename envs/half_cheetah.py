@@ -2,15 +2,10 @@
 
 import dataclasses
 
-import jax.numpy as jnp
-from jax import Array
-from jaxtyping import Bool, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
-from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.planar_body import PlanarBody, PlanarBodyOptions
 from mjx_walk.envs.resets import InitialState, with_normal_velocity
-from mjx_walk.envs.reward_shaping import Terms
-from mjx_walk.envs.state import Carry, State
 from mjx_walk.utils.setting_fields import setting
 
 __all__ = ["HalfCheetah", "HalfCheetahOptions"]
@@ -21,6 +16,8 @@ class HalfCheetahOptions(PlanarBodyOptions):
     """Keyword arguments of Gymnasium's `HalfCheetahEnv`."""
 
     name: str = setting("half_cheetah", choices=("half_cheetah",))
+    exclude_current_positions_from_observation: bool = True
+    """Leave the root's x out of the observation."""
     forward_reward_weight: float = 1.0
     """Weight of the forward velocity."""
     ctrl_cost_weight: float = 0.1
@@ -45,15 +42,3 @@ class HalfCheetah(PlanarBody):
 
     def initial_state(self, key: PRNGKeyArray) -> InitialState:
         return with_normal_velocity(key, self.init_qpos, self.init_qvel, self.options.reset_noise_scale)
-
-    def reward_and_termination(
-        self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
-    ) -> tuple[Terms, Float[Array, ""], Bool[Array, ""]]:
-        options = self.options
-        velocity = (physics.qpos[0] - before.physics.qpos[0]) / self.dt
-        forward, control = self.gymnasium_reward_terms
-        terms = {
-            forward: options.forward_reward_weight * velocity,
-            control: -options.ctrl_cost_weight * jnp.square(action).sum(),
-        }
-        return terms, sum(terms.values(), jnp.float32(0.0)), jnp.zeros((), bool)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
+from mjx_walk.envs.body import HealthOptions, HealthyBody, is_within
 from mjx_walk.envs.humanoid_body import HumanoidBody, HumanoidBodyOptions
 from mjx_walk.envs.info import Info, plane_position, plane_velocity
 from mjx_walk.envs.physics import Derived, PhysicsState
@@ -17,7 +18,7 @@ __all__ = ["Humanoid", "HumanoidOptions"]
 
 
 @dataclasses.dataclass
-class HumanoidOptions(HumanoidBodyOptions):
+class HumanoidOptions(HumanoidBodyOptions, HealthOptions):
     """Keyword arguments of Gymnasium's `HumanoidEnv`. v4 has no contact cost and does not take its options."""
 
     name: str = setting("humanoid", choices=("humanoid",))
@@ -37,7 +38,7 @@ class HumanoidOptions(HumanoidBodyOptions):
     """Heights of the root in which the humanoid is healthy, m."""
 
 
-class Humanoid(HumanoidBody):
+class Humanoid(HealthyBody, HumanoidBody):
     """Humanoid, which runs forward and must not fall.
 
     Source: `gymnasium/envs/mujoco/humanoid_v5.py` and `humanoid_v4.py`.
@@ -53,10 +54,6 @@ class Humanoid(HumanoidBody):
 
     options: HumanoidOptions
 
-    @property
-    def terminates_on_fall(self) -> bool:
-        return self.options.terminate_when_unhealthy
-
     def derived_names(self) -> tuple[str, ...]:
         return (*super().derived_names(), "xipos")
 
@@ -69,26 +66,15 @@ class Humanoid(HumanoidBody):
         self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
     ) -> tuple[Terms, Float[Array, ""], Bool[Array, ""]]:
         options = self.options
-        low, high = options.healthy_z_range
-        is_healthy = (low < physics.qpos[2]) & (physics.qpos[2] < high)
-        terminated = ~is_healthy & options.terminate_when_unhealthy
+        survive, terminated = self.survival(is_within(physics.qpos[2], options.healthy_z_range))
         velocity = (carry["mass_center"][0] - before.memory["mass_center"][0]) / self.dt
-
         forward = options.forward_reward_weight * velocity
-        ctrl = -options.ctrl_cost_weight * jnp.square(action).sum()
-        if options.version == "v4":
-            # v4 also pays the healthy reward in the step that terminates the episode.
-            alive = options.healthy_reward * (is_healthy | options.terminate_when_unhealthy)
-            terms = {"reward_alive": alive, "reward_linvel": forward, "reward_quadctrl": ctrl}
-        else:
+        control = -options.ctrl_cost_weight * jnp.square(action).sum()
+        values = (survive, forward, control)
+        if options.version == "v5":
             contact = -self.contact_cost(derived, options.contact_cost_weight, options.contact_cost_range)
-            survive = options.healthy_reward * is_healthy
-            terms = {
-                "reward_survive": survive,
-                "reward_forward": forward,
-                "reward_ctrl": ctrl,
-                "reward_contact": contact,
-            }
+            values = (*values, contact)
+        terms = dict(zip(self.gymnasium_reward_terms, values, strict=True))
         return terms, sum(terms.values(), jnp.float32(0.0)), terminated
 
     def position_info(self, state: State) -> Info:

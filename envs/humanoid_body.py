@@ -5,25 +5,24 @@ import dataclasses
 import jax.numpy as jnp
 import mujoco
 from jax import Array
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 
+from mjx_walk.envs.body import Body, BodyOptions
 from mjx_walk.envs.info import Info
 from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
-from mjx_walk.envs.resets import InitialState, with_uniform_noise
 from mjx_walk.envs.state import State
 from mjx_walk.envs.task import Task
-from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.utils.setting_fields import setting
 
-__all__ = ["NUM_ROOT_DOFS", "HumanoidBody", "HumanoidBodyOptions"]
+__all__ = ["HumanoidBody", "HumanoidBodyOptions"]
 
-NUM_ROOT_DOFS = 6
+_NUM_ROOT_DOFS = 6
 """Degrees of freedom of the root's free joint, which has no motor."""
 
 
 @dataclasses.dataclass
-class HumanoidBodyOptions(TaskOptions):
+class HumanoidBodyOptions(BodyOptions):
     """Keyword arguments of both humanoids. v4 does not take the flags `include_…`."""
 
     reset_noise_scale: float = setting(1e-2, at_least=0)
@@ -40,7 +39,7 @@ class HumanoidBodyOptions(TaskOptions):
     """Observe the contact forces on each body."""
 
 
-class HumanoidBody(Task):
+class HumanoidBody(Body):
     """Observation and contact cost of the humanoid with 17 motors."""
 
     V5_ONLY = (
@@ -55,9 +54,6 @@ class HumanoidBody(Task):
     MODEL_NEEDS = ModelNeeds(positions=3)
 
     options: HumanoidBodyOptions
-
-    def initial_state(self, key: PRNGKeyArray) -> InitialState:
-        return with_uniform_noise(key, self.init_qpos, self.init_qvel, self.options.reset_noise_scale)
 
     def observed_arrays(self) -> tuple[str, ...]:
         """Names of the `mjData` arrays that the observation holds after positions and velocities, in order."""
@@ -77,13 +73,12 @@ class HumanoidBody(Task):
         """First observed row of an array. v5 skips the world body and the root joint, v4 includes them."""
         if self.options.version == "v4":
             return 0
-        return NUM_ROOT_DOFS if name == "qfrc_actuator" else 1
+        return _NUM_ROOT_DOFS if name == "qfrc_actuator" else 1
 
     def observation_blocks(self) -> dict[str, int]:
         blank = mujoco.MjData(self.model)
-        blocks = {"qpos": self.model.nq - 2 * self.options.exclude_current_positions_from_observation}
-        blocks["qvel"] = self.model.nv
-        return blocks | {name: getattr(blank, name)[self._first_row(name) :].size for name in self.observed_arrays()}
+        sizes = {name: getattr(blank, name)[self._first_row(name) :].size for name in self.observed_arrays()}
+        return super().observation_blocks() | sizes
 
     def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
         """Observation, `[348]` in v5 and `[376]` in v4.
@@ -92,8 +87,7 @@ class HumanoidBody(Task):
         `cfrc_ext` (78). v4 also holds the zero rows of the world body and the zero torques of the root joint.
         """
         blocks = [derived[name][self._first_row(name) :].ravel() for name in self.observed_arrays()]
-        qpos = physics.qpos[2:] if self.options.exclude_current_positions_from_observation else physics.qpos
-        return jnp.concatenate([qpos, physics.qvel, *blocks])
+        return jnp.concatenate([super().observe(physics, derived), *blocks])
 
     def contact_cost(self, derived: Derived, weight: float, bounds: tuple[float, float]) -> Float[Array, ""]:
         """Weighted sum of the squared contact forces on all bodies, clipped to `bounds`."""

@@ -16,11 +16,11 @@ from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.envs.view import View
 from mjx_walk.utils.setting_fields import setting
 
-__all__ = ["MAX_OBSERVED_FORCE", "MAX_OBSERVED_VELOCITY", "InvertedDoublePendulum", "InvertedDoublePendulumOptions"]
+__all__ = ["InvertedDoublePendulum", "InvertedDoublePendulumOptions"]
 
-MAX_OBSERVED_VELOCITY = 10.0
+_MAX_OBSERVED_VELOCITY = 10.0
 """Limit to which observed velocities are clipped, m/s and rad/s."""
-MAX_OBSERVED_FORCE = 10.0
+_MAX_OBSERVED_FORCE = 10.0
 """Limit to which observed constraint forces are clipped, N and N·m."""
 
 
@@ -73,8 +73,8 @@ class InvertedDoublePendulum(Task):
         clipped constraint forces: the cart's (1) in v5, all joints' (3) in v4.
         """
         angles = physics.qpos[1:]
-        qvel = jnp.clip(physics.qvel, -MAX_OBSERVED_VELOCITY, MAX_OBSERVED_VELOCITY)
-        forces = jnp.clip(derived["qfrc_constraint"], -MAX_OBSERVED_FORCE, MAX_OBSERVED_FORCE)
+        qvel = jnp.clip(physics.qvel, -_MAX_OBSERVED_VELOCITY, _MAX_OBSERVED_VELOCITY)
+        forces = jnp.clip(derived["qfrc_constraint"], -_MAX_OBSERVED_FORCE, _MAX_OBSERVED_FORCE)
         observed_forces = forces[: self.observation_blocks()["qfrc_constraint"]]
         return jnp.concatenate([physics.qpos[:1], jnp.sin(angles), jnp.cos(angles), qvel, observed_forces])
 

@@ -17,9 +17,9 @@ from mjx_walk.envs.task_options import MAX_FRAME_SKIP, TaskOptions
 from mjx_walk.envs.view import View
 from mjx_walk.utils.setting_fields import setting
 
-__all__ = ["MAX_ANGLE", "InvertedPendulum", "InvertedPendulumOptions"]
+__all__ = ["InvertedPendulum", "InvertedPendulumOptions"]
 
-MAX_ANGLE = 0.2
+_MAX_ANGLE = 0.2
 """Largest angle of the pole from the vertical, rad."""
 
 
@@ -70,7 +70,7 @@ class InvertedPendulum(Task):
     def reward_and_termination(
         self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
     ) -> tuple[Terms, Float[Array, ""], Bool[Array, ""]]:
-        terminated = jnp.abs(physics.qpos[1]) > MAX_ANGLE
+        terminated = jnp.abs(physics.qpos[1]) > _MAX_ANGLE
         # v4 also pays in the step that terminates the episode.
         reward = jnp.float32(~terminated | (self.options.version == "v4"))
         return {"reward_survive": reward}, reward, terminated

@@ -24,7 +24,6 @@ __all__ = [
     "check_pose",
     "is_coordinate",
     "load_model",
-    "load_with_sources",
     "warn_of_changed_sources",
     "warn_of_coordinates",
 ]
@@ -103,12 +102,6 @@ def _has_enough_memory(path: Path, model: mujoco.MjModel) -> bool:
     except (mujoco.FatalError, ValueError):
         return False
     return not data.warning.number[_LOST].any()
-
-
-def load_with_sources(xml_file: str) -> tuple[mujoco.MjModel, dict[str, str]]:
-    """Load a model, and hash the files that MuJoCo reads for it, for `warn_of_changed_sources`. See `load_model`."""
-    model = load_model(xml_file)
-    return model, source_hashes(xml_file)
 
 
 def warn_of_changed_sources(xml_file: str, sources: dict[str, str]) -> None:

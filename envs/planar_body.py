@@ -1,55 +1,88 @@
-"""Base of Walker2d, Hopper and HalfCheetah: a body that runs along x, in the plane of x and z."""
-
-import dataclasses
+"""Bases of HalfCheetah, Swimmer, Hopper and Walker2d: bodies that move along x, in a plane."""
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from mjx_walk.envs.body import Body, BodyOptions, HealthOptions, HealthyBody, is_within
 from mjx_walk.envs.info import Info
+from mjx_walk.envs.models import ModelNeeds
 from mjx_walk.envs.physics import Derived, PhysicsState
-from mjx_walk.envs.state import State
-from mjx_walk.envs.task import Task
-from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.reward_shaping import Terms
+from mjx_walk.envs.state import Carry, State
 
-__all__ = ["PlanarBody", "PlanarBodyOptions"]
-
-
-@dataclasses.dataclass
-class PlanarBodyOptions(TaskOptions):
-    """Keyword argument of all planar bodies."""
-
-    exclude_current_positions_from_observation: bool = True
-    """Leave the root's x out of the observation."""
+__all__ = ["PlanarBody", "PlanarBodyOptions", "PlanarWalker", "PlanarWalkerOptions"]
 
 
-class PlanarBody(Task):
-    """A body whose first coordinates are x, z and the torso's angle. It is observed without x, in its coordinates."""
+class PlanarBodyOptions(BodyOptions):
+    """Keyword arguments that `PlanarBody` reads. The dataclass of each task defines them, in Gymnasium's order."""
+
+    forward_reward_weight: float
+    ctrl_cost_weight: float
+
+
+class PlanarBody(Body):
+    """A body in the plane of x and z, whose first coordinates are x, z and the torso's angle. It runs forward."""
 
     HAS_Y = False
     HEIGHT_INDEX = 1
-    MAX_OBSERVED_VELOCITY: float | None = None
-    """Limit to which observed velocities are clipped, m/s and rad/s. None: they are not clipped."""
+    NUM_PLACE_COORDINATES = 1
 
     options: PlanarBodyOptions
 
-    def derived_names(self) -> tuple[str, ...]:
-        return ()
-
-    def observation_blocks(self) -> dict[str, int]:
-        skipped = int(self.options.exclude_current_positions_from_observation)
-        return {"qpos": self.model.nq - skipped, "qvel": self.model.nv}
-
-    def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
-        """Observation: height, torso angle and joint angles, then all velocities."""
-        qpos = physics.qpos[1:] if self.options.exclude_current_positions_from_observation else physics.qpos
-        qvel, limit = physics.qvel, self.MAX_OBSERVED_VELOCITY
-        if limit is not None:
-            qvel = jnp.clip(qvel, -limit, limit)
-        return jnp.concatenate([qpos, qvel])
+    def reward_and_termination(
+        self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
+    ) -> tuple[Terms, Float[Array, ""], Bool[Array, ""]]:
+        """The weighted forward velocity minus the control cost. Episodes end only at the time limit."""
+        velocity = (physics.qpos[0] - before.physics.qpos[0]) / self.dt
+        forward, control, *_ = self.gymnasium_reward_terms
+        terms = {
+            forward: self.options.forward_reward_weight * velocity,
+            control: -self.options.ctrl_cost_weight * jnp.square(action).sum(),
+        }
+        return terms, sum(terms.values(), jnp.float32(0.0)), jnp.zeros((), bool)
 
     def position_info(self, state: State) -> Info:
         return {"x_position": state.physics.qpos[0]}
 
     def velocity_info(self, before: State, after: State) -> Info:
         return {"x_velocity": (after.physics.qpos[0] - before.physics.qpos[0]) / self.dt}
+
+
+class PlanarWalkerOptions(PlanarBodyOptions, HealthOptions):
+    """Keyword arguments that `PlanarWalker` reads. The dataclass of each task defines them, in Gymnasium's order."""
+
+    healthy_z_range: tuple[float, float]
+    healthy_angle_range: tuple[float, float]
+
+
+class PlanarWalker(HealthyBody, PlanarBody):
+    """Hopper and Walker2d, which must not fall. Their observed velocities are clipped."""
+
+    REWARD_TERMS = dict.fromkeys(("v5", "v4"), ("reward_forward", "reward_ctrl", "reward_survive"))
+    V4_INFO_HAS_TERMS = False
+    MODEL_NEEDS = ModelNeeds(positions=3)
+    MAX_OBSERVED_VELOCITY = 10.0
+    """Limit to which observed velocities are clipped, m/s and rad/s."""
+
+    options: PlanarWalkerOptions
+
+    def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
+        qvel = jnp.clip(physics.qvel, -self.MAX_OBSERVED_VELOCITY, self.MAX_OBSERVED_VELOCITY)
+        return super().observe(physics._replace(qvel=qvel), derived)
+
+    def is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
+        """Whether the root's height and the torso's angle are within their ranges."""
+        is_high = is_within(physics.qpos[1], self.options.healthy_z_range)
+        return is_high & is_within(physics.qpos[2], self.options.healthy_angle_range)
+
+    def reward_and_termination(
+        self, before: State, physics: PhysicsState, derived: Derived, carry: Carry, action: Float[Array, " action_size"]
+    ) -> tuple[Terms, Float[Array, ""], Bool[Array, ""]]:
+        terms, reward, _ = super().reward_and_termination(before, physics, derived, carry, action)
+        survive, terminated = self.survival(self.is_healthy(physics))
+        return terms | {"reward_survive": survive}, reward + survive, terminated
+
+    def position_info(self, state: State) -> Info:
+        height = {"z_distance_from_origin": state.physics.qpos[1] - self.init_qpos[1]}
+        return super().position_info(state) | (height if self.options.version == "v5" else {})

@@ -17,25 +17,16 @@ from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.envs.view import View
 from mjx_walk.utils.setting_fields import setting
 
-__all__ = [
-    "MIN_GOAL_DISTANCE",
-    "NUM_JOINTS",
-    "NUM_PLACED",
-    "OBJECT_HIGH",
-    "OBJECT_LOW",
-    "VELOCITY_NOISE",
-    "Pusher",
-    "PusherOptions",
-]
+__all__ = ["Pusher", "PusherOptions"]
 
-VELOCITY_NOISE = 5e-3
+_VELOCITY_NOISE = 5e-3
 """Limit of the uniform noise on the joint velocities of a reset, rad/s."""
-OBJECT_LOW, OBJECT_HIGH = (-0.3, -0.2), (0.0, 0.2)
+_OBJECT_LOW, _OBJECT_HIGH = (-0.3, -0.2), (0.0, 0.2)
 """Corners of the rectangle in which the object is drawn, relative to the goal, m."""
-MIN_GOAL_DISTANCE = 0.17
+_MIN_GOAL_DISTANCE = 0.17
 """Least distance of the object from the goal at a reset, m."""
-NUM_JOINTS = 7
-NUM_PLACED = 4
+_NUM_JOINTS = 7
+_NUM_PLACED = 4
 """Coordinates of the object and the goal, the last ones."""
 
 
@@ -65,7 +56,7 @@ class Pusher(Task):
     MISSING_VERSIONS = {"v4": "Gymnasium supports Pusher-v4 only with MuJoCo below 3"}
     REWARD_TERMS = {"v5": ("reward_dist", "reward_ctrl", "reward_near")}
     HAS_X = HAS_Y = False
-    MODEL_NEEDS = ModelNeeds(positions=NUM_JOINTS + NUM_PLACED, velocities=NUM_JOINTS + NUM_PLACED)
+    MODEL_NEEDS = ModelNeeds(positions=_NUM_JOINTS + _NUM_PLACED, velocities=_NUM_JOINTS + _NUM_PLACED)
     VIEW = View(body=11, center=(0.4, -0.2, -0.2), distance=2.2, elevation=-40.0, azimuth=200.0)
 
     options: PusherOptions
@@ -73,16 +64,16 @@ class Pusher(Task):
     def initial_state(self, key: PRNGKeyArray) -> InitialState:
         """Draw joint velocities, and an object that is not too close to the goal."""
         object_key, velocity_key = jax.random.split(key)
-        moving = self.model.nv - NUM_PLACED
-        velocities = jax.random.uniform(velocity_key, (moving,), minval=-VELOCITY_NOISE, maxval=VELOCITY_NOISE)
-        low, high = jnp.float32(OBJECT_LOW), jnp.float32(OBJECT_HIGH)
+        moving = self.model.nv - _NUM_PLACED
+        velocities = jax.random.uniform(velocity_key, (moving,), minval=-_VELOCITY_NOISE, maxval=_VELOCITY_NOISE)
+        low, high = jnp.float32(_OBJECT_LOW), jnp.float32(_OBJECT_HIGH)
 
         def draw(drawn):
             key, draw_key = jax.random.split(drawn[0])
             return key, jax.random.uniform(draw_key, (2,), minval=low, maxval=high)
 
         _, position = jax.lax.while_loop(
-            lambda drawn: jnp.linalg.norm(drawn[1]) <= MIN_GOAL_DISTANCE, draw, (object_key, jnp.zeros(2))
+            lambda drawn: jnp.linalg.norm(drawn[1]) <= _MIN_GOAL_DISTANCE, draw, (object_key, jnp.zeros(2))
         )
         qpos = self.init_qpos.at[-4:-2].set(position).at[-2:].set(0.0)
         return qpos, self.init_qvel.at[:moving].add(velocities).at[moving:].set(0.0)
@@ -94,11 +85,11 @@ class Pusher(Task):
         return ("xpos",)
 
     def observation_blocks(self) -> dict[str, int]:
-        return {"qpos": NUM_JOINTS, "qvel": NUM_JOINTS, "tips_arm": 3, "object": 3, "goal": 3}
+        return {"qpos": _NUM_JOINTS, "qvel": _NUM_JOINTS, "tips_arm": 3, "object": 3, "goal": 3}
 
     def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
         """Observation `[23]`: joint angles, joint velocities, and the positions of fingertip, object and goal."""
-        return jnp.concatenate([physics.qpos[:NUM_JOINTS], physics.qvel[:NUM_JOINTS], *self._positions(derived)])
+        return jnp.concatenate([physics.qpos[:_NUM_JOINTS], physics.qvel[:_NUM_JOINTS], *self._positions(derived)])
 
     def _positions(self, derived: Derived) -> list[Float[Array, "3"]]:
         """Positions of fingertip, object and goal, m."""

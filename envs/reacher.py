@@ -17,13 +17,13 @@ from mjx_walk.envs.task_options import MAX_FRAME_SKIP, TaskOptions
 from mjx_walk.envs.view import View
 from mjx_walk.utils.setting_fields import setting
 
-__all__ = ["ANGLE_NOISE", "TARGET_RADIUS", "VELOCITY_NOISE", "Reacher", "ReacherOptions"]
+__all__ = ["Reacher", "ReacherOptions"]
 
-ANGLE_NOISE = 0.1
+_ANGLE_NOISE = 0.1
 """Limit of the uniform noise on the joint angles of a reset, rad."""
-VELOCITY_NOISE = 5e-3
+_VELOCITY_NOISE = 5e-3
 """Limit of the uniform noise on the joint velocities of a reset, rad/s."""
-TARGET_RADIUS = 0.2
+_TARGET_RADIUS = 0.2
 """Radius of the disc in which targets are drawn, m."""
 
 
@@ -60,10 +60,10 @@ class Reacher(Task):
     def initial_state(self, key: PRNGKeyArray) -> InitialState:
         """Draw joint angles, joint velocities, and a target uniformly in the disc."""
         angle_key, velocity_key, radius_key, direction_key = jax.random.split(key, 4)
-        angles = jax.random.uniform(angle_key, (2,), minval=-ANGLE_NOISE, maxval=ANGLE_NOISE)
-        velocities = jax.random.uniform(velocity_key, (2,), minval=-VELOCITY_NOISE, maxval=VELOCITY_NOISE)
+        angles = jax.random.uniform(angle_key, (2,), minval=-_ANGLE_NOISE, maxval=_ANGLE_NOISE)
+        velocities = jax.random.uniform(velocity_key, (2,), minval=-_VELOCITY_NOISE, maxval=_VELOCITY_NOISE)
         # The square root spreads the targets evenly over the disc. Gymnasium rejects draws outside it instead.
-        radius = TARGET_RADIUS * jnp.sqrt(jax.random.uniform(radius_key))
+        radius = _TARGET_RADIUS * jnp.sqrt(jax.random.uniform(radius_key))
         direction = 2.0 * jnp.pi * jax.random.uniform(direction_key)
         target = radius * jnp.stack([jnp.cos(direction), jnp.sin(direction)])
         qpos = jnp.concatenate([self.init_qpos[:2] + angles, target])

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from mjx_walk.envs import models
 from mjx_walk.envs.info import GymnasiumInfo
 from mjx_walk.envs.model_changes import ModelSnapshot
+from mjx_walk.envs.model_files import source_hashes
 from mjx_walk.envs.motors import motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
@@ -72,7 +73,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         self.options = options = with_absolute_paths(options, working_folder())
         self.max_episode_steps = options.max_episode_steps
         self.model_file = options.xml_file or self.XML_FILES[options.version]
-        self.model, self.model_sources = models.load_with_sources(self.model_file)
+        self.model = models.load_model(self.model_file)
+        self.model_sources = source_hashes(self.model_file)
         self.body_ids = {body: models.body_id(self.model, body) for body in self.named_bodies()}
         models.check_model(self.model, options.name, self.MODEL_NEEDS)
         if options.xml_file:
@@ -140,7 +142,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         """Whether the reward differs from Gymnasium's."""
         return self._reward_function is not None or any(vars(self.options.shaping).values())
 
-    # Defined by each task.
+    # Defined by each task, up to `reset`.
 
     @property
     def terminates_on_fall(self) -> bool:
@@ -187,8 +189,6 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         Returns:
             Signed reward terms; the reward, their sum as Gymnasium computes it; and whether the task terminates.
         """
-
-    # Shared by all tasks.
 
     @standard_dtypes()
     def reset(self, key: PRNGKeyArray) -> State:

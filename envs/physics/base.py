@@ -5,7 +5,6 @@ from typing import NamedTuple, ParamSpec, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
-import mujoco
 from jax import Array
 from jax.custom_batching import custom_vmap
 from jaxtyping import Bool, Float
@@ -13,7 +12,7 @@ from jaxtyping import Bool, Float
 from mjx_walk.envs.physics.preparation import Preparation
 from mjx_walk.machine.compat import standard_dtypes
 
-__all__ = ["Derived", "Engine", "EngineFactory", "PhysicsState", "batch_once"]
+__all__ = ["Derived", "Engine", "PhysicsState", "batch_once"]
 
 Derived = dict[str, Array]
 """MuJoCo arrays by their `mjData` names, for example `cinert`, `[nbody, 10] f32`."""
@@ -66,9 +65,6 @@ class Engine(Protocol):
 
 _Arguments = ParamSpec("_Arguments")
 _Outputs = TypeVar("_Outputs")
-
-EngineFactory = Callable[[mujoco.MjModel, int, tuple[str, ...]], Engine]
-"""`(model, num_substeps, derived) → Engine`."""
 
 
 def batch_once(batch_fn: Callable[_Arguments, _Outputs]) -> Callable[_Arguments, _Outputs]:

@@ -11,24 +11,16 @@ import jax
 import numpy as np
 
 from mjx_walk.envs import NO_TIME_LIMIT, State, make_options
-from mjx_walk.envs.model_changes import ModelSnapshot
-from mjx_walk.envs.models import warn_of_changed_sources
 from mjx_walk.envs.state import check_action_shape
+from mjx_walk.interop.compiled_env import CompiledEnv
 from mjx_walk.interop.gymnasium_info import single_info
-from mjx_walk.interop.gymnasium_programs import is_forked, make_programs, refuse_fork
-from mjx_walk.interop.mujoco_attributes import (
-    RENDER_MODES,
-    MujocoAttributes,
-    make_gymnasium_env,
-    split_keywords,
-)
+from mjx_walk.interop.gymnasium_programs import refuse_fork
+from mjx_walk.interop.mujoco_attributes import RENDER_MODES, MujocoAttributes, split_keywords
 
 __all__ = ["MjxWalkEnv"]
 
-_NOT_PICKLED = ("_gymnasium_env", "_snapshot", "_programs")
 
-
-class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
+class MjxWalkEnv(CompiledEnv, MujocoAttributes, gymnasium.Env):
     """One environment. `gymnasium.make` adds the time limit as a wrapper.
 
     Copies and pickles keep the state and the random generator.
@@ -51,16 +43,7 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
         self._physics = physics
         self._state: State | None = None
         self._build()
-        self.metadata = self._gymnasium_env.metadata | {"render_fps": round(1.0 / self._gymnasium_env.dt)}
-        self.render_mode = self._gymnasium_env.render_mode
-        self.observation_space = self._gymnasium_env.observation_space
-        self.action_space = self._gymnasium_env.action_space
-
-    def _build(self) -> None:
-        if not is_forked():  # a vectorizer may first ask a worker for its spaces
-            self._programs = make_programs(self._options, self._physics)
-        self._gymnasium_env = make_gymnasium_env(self._options, self._rendering)
-        self._snapshot = ModelSnapshot(self._gymnasium_env.model)
+        self.observation_space, self.action_space = self._describe()
 
     def reset(self, *, seed: int | None = None, options: dict[str, object] | None = None):
         """Start an episode. A seed gives the start that it gives in Gymnasium, and determines all later episodes.
@@ -113,12 +96,9 @@ class MjxWalkEnv(MujocoAttributes, gymnasium.Env):
         self._state, _ = self._programs.reset_to(qpos, qvel, warmstart)
 
     def __getstate__(self) -> dict[str, object]:
-        state = {name: jax.device_get(value) for name, value in vars(self).items() if name not in _NOT_PICKLED}
-        return state | {"_init": (self.init_qpos, self.init_qvel), "_sources": self._programs.task.model_sources}
+        return super().__getstate__() | {"_init": (self.init_qpos, self.init_qvel)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        init, sources = state.pop("_init"), state.pop("_sources")
-        vars(self).update(state)
-        self._build()
-        warn_of_changed_sources(self._programs.task.model_file, sources)
+        init = state.pop("_init")
+        super().__setstate__(state)
         self.init_qpos, self.init_qvel = init

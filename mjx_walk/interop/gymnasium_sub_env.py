@@ -1,6 +1,6 @@
 """One environment of the vector environment, for code that asks for its attributes."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium
 import jax
@@ -51,25 +51,11 @@ class SubEnv(MujocoAttributes):
     def np_random_seed(self) -> int:
         return self._vector_env.np_random_seed[self._index]
 
-    @property
-    def unwrapped(self) -> "SubEnv":
-        """Itself: no wrapper is around one environment."""
-        return self
-
-    def get_wrapper_attr(self, name: str) -> Any:
-        """An attribute, as `gymnasium.Env.get_wrapper_attr` finds it."""
-        return getattr(self, name)
-
-    def has_wrapper_attr(self, name: str) -> bool:
-        """Whether there is an attribute."""
-        return hasattr(self, name)
-
-    def set_wrapper_attr(self, name: str, value: object, *, force: bool = True) -> bool:
-        """Set an attribute; without `force`, only one that exists. Returns whether it was set."""
-        if force or hasattr(self, name):
-            setattr(self, name, value)
-            return True
-        return False
+    # No wrapper is around one environment.
+    unwrapped = gymnasium.Env.unwrapped
+    get_wrapper_attr = gymnasium.Env.get_wrapper_attr
+    has_wrapper_attr = gymnasium.Env.has_wrapper_attr
+    set_wrapper_attr = gymnasium.Env.set_wrapper_attr
 
     def _read_state(self) -> State | None:
         return jax.tree.map(lambda x: x[self._index], self._vector_env._state)

@@ -7,27 +7,24 @@ import gymnasium
 import jax
 import numpy as np
 from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
 
 from mjx_walk.envs import NO_TIME_LIMIT, State, make_options
 from mjx_walk.envs.info import Info
-from mjx_walk.envs.model_changes import ModelSnapshot
-from mjx_walk.envs.models import warn_of_changed_sources
 from mjx_walk.envs.state import check_action_shape
+from mjx_walk.interop.compiled_env import CompiledEnv
 from mjx_walk.interop.gymnasium_info import add_flags, add_info
-from mjx_walk.interop.gymnasium_programs import make_programs, refuse_fork
+from mjx_walk.interop.gymnasium_programs import refuse_fork
 from mjx_walk.interop.gymnasium_sub_env import SubEnv
-from mjx_walk.interop.mujoco_attributes import RENDER_MODES, make_gymnasium_env, split_keywords
+from mjx_walk.interop.mujoco_attributes import RENDER_MODES, split_keywords
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.value_types import type_problem
 
 __all__ = ["MjxWalkVectorEnv"]
 
-_NOT_PICKLED = ("_gymnasium_env", "_snapshot", "_init", "_programs", "envs")
 
-
-class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
+class MjxWalkVectorEnv(CompiledEnv, gymnasium.vector.VectorEnv):
     """B environments that behave as in Gymnasium's `SyncVectorEnv`, with the same modes of automatic resets.
 
     Resets are drawn on the device: a seed determines an environment's episodes, but gives other starts than Gymnasium.
@@ -35,6 +32,7 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "autoreset_mode": AutoresetMode.NEXT_STEP}
+    _NOT_PICKLED = (*CompiledEnv._NOT_PICKLED, "_init", "envs")
 
     def __init__(
         self,
@@ -78,18 +76,13 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         self._is_over = np.zeros(num_envs, np.bool_)
         self._build()
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        fps = round(1.0 / self._gymnasium_env.dt)
-        self.metadata = self._gymnasium_env.metadata | {"render_fps": fps, "autoreset_mode": self.autoreset_mode}
-        self.render_mode = self._gymnasium_env.render_mode
-        self.single_observation_space = self._gymnasium_env.observation_space
-        self.single_action_space = self._gymnasium_env.action_space
+        self.single_observation_space, self.single_action_space = self._describe()
+        self.metadata |= {"autoreset_mode": self.autoreset_mode}
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def _build(self) -> None:
-        self._programs = make_programs(self._options, self._physics)
-        self._gymnasium_env = make_gymnasium_env(self._options, self._rendering)
-        self._snapshot = ModelSnapshot(self._gymnasium_env.model)
+        super()._build()
         self._init = {name: getattr(self._gymnasium_env, name).copy() for name in ("init_qpos", "init_qvel")}
         self.envs = [SubEnv(self, i) for i in range(self.num_envs)]
 
@@ -182,30 +175,11 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
         info |= {"final_obs": final_obs, "_final_obs": is_over.copy()}
         info |= {"final_info": final_info, "_final_info": is_over.copy()}
 
-    def render(self) -> tuple[Any, ...] | None:
-        """A frame of each environment."""
-        return tuple(env.render() for env in self.envs)
-
-    def call(self, name: str, *args: object, **kwargs: object) -> tuple[Any, ...]:
-        """Results of a method of each environment, or values of an attribute; see `SubEnv`."""
-        found = [getattr(env, name) for env in self.envs]
-        return tuple(value(*args, **kwargs) if callable(value) else value for value in found)
-
-    def get_attr(self, name: str) -> tuple[Any, ...]:
-        """Values of an attribute of each environment."""
-        return self.call(name)
-
-    def set_attr(self, name: str, values: object) -> None:
-        """Set an attribute of each environment, from a list or tuple of B values or from one value.
-
-        Raises:
-            ValueError: a list or tuple of another length.
-        """
-        listed = values if isinstance(values, (list, tuple)) else [values] * self.num_envs
-        if len(listed) != self.num_envs:
-            raise ValueError(f"got {len(listed)} values for {self.num_envs} environments")
-        for env, value in zip(self.envs, listed, strict=True):
-            setattr(env, name, value)
+    # These need nothing of Gymnasium's class but `envs`, which are `SubEnv`s here.
+    render = SyncVectorEnv.render  # type: ignore[assignment]
+    call = SyncVectorEnv.call  # type: ignore[assignment]
+    get_attr = SyncVectorEnv.get_attr  # type: ignore[assignment]
+    set_attr = SyncVectorEnv.set_attr  # type: ignore[assignment]
 
     def close_extras(self, **kwargs: object) -> None:
         """Close the OpenGL contexts."""
@@ -243,16 +217,6 @@ class MjxWalkVectorEnv(gymnasium.vector.VectorEnv):
                 rng, known[i] = seeding.np_random(seeds[i])
                 keys[i] = rng.integers(2**32, size=2, dtype=np.uint32)
         self._keys, self._seeds = keys, tuple(known)
-
-    def __getstate__(self) -> dict[str, object]:
-        state = {name: jax.device_get(value) for name, value in vars(self).items() if name not in _NOT_PICKLED}
-        return state | {"_sources": self._programs.task.model_sources}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        sources = state.pop("_sources")
-        vars(self).update(state)
-        self._build()
-        warn_of_changed_sources(self._programs.task.model_file, sources)
 
 
 def _with_gymnasiums_limit(options: dict[str, object]) -> dict[str, object]:

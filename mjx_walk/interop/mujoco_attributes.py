@@ -4,7 +4,7 @@ Each environment holds one of Gymnasium, which draws resets and renders, and is 
 """
 
 import inspect
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import gymnasium
 import mujoco
@@ -47,6 +47,8 @@ _SETTABLE = (
 
 RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple")
 
+_Value = TypeVar("_Value")
+
 
 def split_keywords(keywords: dict[str, object]) -> tuple[dict[str, object], dict[str, object]]:
     """Keywords of the task, and those of `RENDER_KEYWORDS`."""
@@ -72,6 +74,19 @@ def make_gymnasium_env(options: TaskOptions, rendering: dict[str, object]) -> Mu
         return create(**spec.kwargs | options.gymnasium_kwargs() | rendering)
 
 
+class _Forwarded(Generic[_Value]):
+    """An attribute that Gymnasium's environment holds."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, env: "MujocoAttributes", owner: type) -> _Value:
+        return getattr(env._gymnasium_env, self._name)
+
+    def __set__(self, env: "MujocoAttributes", value: _Value) -> None:
+        setattr(env._gymnasium_env, self._name, value)
+
+
 class MujocoAttributes:
     """The attributes of Gymnasium's `MujocoEnv`, except for a live `data`.
 
@@ -81,6 +96,22 @@ class MujocoAttributes:
 
     _gymnasium_env: MujocoEnv
     render_mode: str | None
+
+    model = _Forwarded[mujoco.MjModel]()
+    """A copy of the MuJoCo model, from which frames are rendered. Changes of its physics are refused."""
+    dt = _Forwarded[float]()
+    """Duration of a step, s."""
+    frame_skip = _Forwarded[int]()
+    init_qpos = _Forwarded[np.ndarray]()
+    """`[nq] f64`, m and rad: the pose to which resets add noise."""
+    init_qvel = _Forwarded[np.ndarray]()
+    """`[nv] f64`, m/s and rad/s."""
+    observation_structure = _Forwarded[dict[str, int]]()
+    """Sizes of the observation's parts, of the tasks for which Gymnasium defines them."""
+    width = _Forwarded[int]()
+    height = _Forwarded[int]()
+    camera_id = _Forwarded[int | None]()
+    camera_name = _Forwarded[str | None]()
 
     def __setattr__(self, name: str, value: object) -> None:
         """Set an attribute of the environment.
@@ -106,59 +137,6 @@ class MujocoAttributes:
 
     def _write_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
         raise NotImplementedError
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        """A copy of the MuJoCo model, from which frames are rendered. Changes of its physics are refused."""
-        return self._gymnasium_env.model
-
-    @property
-    def dt(self) -> float:
-        """Duration of a step, s."""
-        return self._gymnasium_env.dt
-
-    @property
-    def frame_skip(self) -> int:
-        return self._gymnasium_env.frame_skip
-
-    @property
-    def init_qpos(self) -> np.ndarray:
-        """`[nq] f64`, m and rad: the pose to which resets add noise."""
-        return self._gymnasium_env.init_qpos
-
-    @init_qpos.setter
-    def init_qpos(self, value: np.ndarray) -> None:
-        self._gymnasium_env.init_qpos = value
-
-    @property
-    def init_qvel(self) -> np.ndarray:
-        """`[nv] f64`, m/s and rad/s."""
-        return self._gymnasium_env.init_qvel
-
-    @init_qvel.setter
-    def init_qvel(self, value: np.ndarray) -> None:
-        self._gymnasium_env.init_qvel = value
-
-    @property
-    def observation_structure(self) -> dict[str, int]:
-        """Sizes of the observation's parts, of the tasks for which Gymnasium defines them."""
-        return self._gymnasium_env.observation_structure  # type: ignore[attr-defined]
-
-    @property
-    def width(self) -> int:
-        return self._gymnasium_env.width
-
-    @property
-    def height(self) -> int:
-        return self._gymnasium_env.height
-
-    @property
-    def camera_id(self) -> int | None:
-        return self._gymnasium_env.camera_id
-
-    @property
-    def camera_name(self) -> str | None:
-        return self._gymnasium_env.camera_name
 
     def state_vector(self) -> np.ndarray:
         """Position and velocity, `[nq + nv] f64`."""

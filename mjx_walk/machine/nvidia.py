@@ -12,20 +12,11 @@ from pathlib import Path
 
 import jax
 
-__all__ = [
-    "CUDA_12_DRIVER",
-    "CUDA_13_DRIVER",
-    "ROOT",
-    "Machine",
-    "installed_version",
-    "warn_of_unused_gpu",
-    "warp_misfit",
-    "why_unused",
-]
+__all__ = ["ROOT", "Machine", "installed_version", "warn_of_unused_gpu", "warp_misfit", "why_unused"]
 
-CUDA_13_DRIVER = 580
+_CUDA_13_DRIVER = 580
 """Oldest release of the driver for CUDA 13, on Linux."""
-CUDA_12_DRIVER = 525
+_CUDA_12_DRIVER = 525
 """Oldest release of the driver for CUDA 12, on Linux."""
 
 ROOT = Path("/")
@@ -68,7 +59,7 @@ class Machine:
         is_listed = any((root / "proc/driver/nvidia/gpus").glob("*")) or (not devices and _is_on_pci(root))
         release = int(version.partition(".")[0]) if version else None
         if cuda is not None and (release is None or cuda // 1000 >= 13):  # newer libraries for older drivers exist
-            release = CUDA_13_DRIVER if cuda // 1000 >= 13 else CUDA_12_DRIVER if cuda // 1000 == 12 else 0
+            release = _CUDA_13_DRIVER if cuda // 1000 >= 13 else _CUDA_12_DRIVER if cuda // 1000 == 12 else 0
             version = version or f"for CUDA {cuda // 1000}.{cuda % 1000 // 10}"
         return cls(bool(devices) or is_wsl or is_listed, bool(devices) or is_wsl, version, release)
 
@@ -132,7 +123,7 @@ def why_unused(
 
 def _why_out_of_reach(machine: Machine) -> str:
     if machine.driver is None:
-        return f"no NVIDIA driver is loaded; install release {CUDA_13_DRIVER} or later"
+        return f"no NVIDIA driver is loaded; install release {_CUDA_13_DRIVER} or later"
     return "this container has no access to it; start it with GPUs, for example docker run --gpus all"
 
 
@@ -140,23 +131,23 @@ def _what_to_install(machine: Machine) -> str:
     """The `pip install` for the driver of a machine."""
     if machine.release is None:
         return (
-            f"pip install 'mjx-walk[cuda]' with driver {CUDA_13_DRIVER} or later, "
-            f"'mjx-walk[cuda12]' with driver {CUDA_12_DRIVER} or later"
+            f"pip install 'mjx-walk[cuda]' with driver {_CUDA_13_DRIVER} or later, "
+            f"'mjx-walk[cuda12]' with driver {_CUDA_12_DRIVER} or later"
         )
-    if machine.release >= CUDA_13_DRIVER:
+    if machine.release >= _CUDA_13_DRIVER:
         return "pip install 'mjx-walk[cuda]'"
-    if machine.release >= CUDA_12_DRIVER:
-        return f"pip install 'mjx-walk[cuda12]', since the driver, {machine.driver}, is older than {CUDA_13_DRIVER}"
-    return f"update the driver, {machine.driver}, to {CUDA_13_DRIVER} or later, and pip install 'mjx-walk[cuda]'"
+    if machine.release >= _CUDA_12_DRIVER:
+        return f"pip install 'mjx-walk[cuda12]', since the driver, {machine.driver}, is older than {_CUDA_13_DRIVER}"
+    return f"update the driver, {machine.driver}, to {_CUDA_13_DRIVER} or later, and pip install 'mjx-walk[cuda]'"
 
 
 def _why_plugin_fails(
     machine: Machine, cuda: int, installed: Mapping[str, str], error: str | None, visible: str | None
 ) -> str:
-    needed = CUDA_13_DRIVER if cuda == 13 else CUDA_12_DRIVER
+    needed = _CUDA_13_DRIVER if cuda == 13 else _CUDA_12_DRIVER
     if machine.release is not None and machine.release < needed:
         why = f"the driver, {machine.driver}, is older than {needed}, which JAX's CUDA {cuda} plugin needs; update it"
-        if machine.release < CUDA_12_DRIVER:
+        if machine.release < _CUDA_12_DRIVER:
             return why
         return f"{why}, or pip uninstall jax-cuda13-plugin jax-cuda13-pjrt and pip install 'mjx-walk[cuda12]'"
     plugin, jaxlib = installed[f"jax-cuda{cuda}-plugin"], installed.get("jaxlib", "")
@@ -200,10 +191,10 @@ def warp_misfit(machine: Machine, version: str | None) -> str | None:
     """
     if version is None:
         return None
-    needed = CUDA_12_DRIVER if "+cu12" in version else CUDA_13_DRIVER
+    needed = _CUDA_12_DRIVER if "+cu12" in version else _CUDA_13_DRIVER
     if machine.release is None or machine.release >= needed:
         return None
     update = f"the NVIDIA driver, {machine.driver}, is older than {needed}, which Warp {version} needs; update it"
-    if machine.release < CUDA_12_DRIVER:
+    if machine.release < _CUDA_12_DRIVER:
         return update
     return f"{update}, or install the +cu12 wheel of github.com/NVIDIA/warp/releases"

@@ -2,10 +2,14 @@
 
 import contextlib
 from collections.abc import Iterator
+from pathlib import Path
 
+import matplotlib.figure
 import matplotlib.style
 
-__all__ = ["standard_style"]
+from mjx_walk.storage.files import replacing
+
+__all__ = ["save_figure", "standard_style"]
 
 
 @contextlib.contextmanager
@@ -16,3 +20,10 @@ def standard_style() -> Iterator[None]:
     """
     with matplotlib.style.context(["default", {"text.parse_math": False}]):
         yield
+
+
+def save_figure(figure: matplotlib.figure.Figure, path: Path, dpi: int = 110) -> Path:
+    """Write a figure to a file, atomically. Returns the file's path."""
+    with replacing(path) as new:
+        figure.savefig(new, dpi=dpi)
+    return path

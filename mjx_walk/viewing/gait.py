@@ -9,10 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.gridspec import SubplotSpec
 
 from mjx_walk.envs.motors import joint_of
-from mjx_walk.storage.files import replacing
 from mjx_walk.utils.text import format_score
 from mjx_walk.viewing.episode import Episode
-from mjx_walk.viewing.figures import standard_style
+from mjx_walk.viewing.figures import save_figure, standard_style
 
 __all__ = ["draw_gait_sheet", "frame_strip"]
 
@@ -53,9 +52,7 @@ def draw_gait_sheet(episode: Episode, path: Path) -> Path:
     terms.set_ylabel("reward term per step")
     for axes in figure.axes[1:]:
         axes.grid(alpha=0.3)
-    with replacing(path) as new:
-        figure.savefig(new, dpi=100)
-    return path
+    return save_figure(figure, path, dpi=100)
 
 
 def frame_strip(episode: Episode, start: float, seconds: float) -> np.ndarray:

@@ -11,10 +11,9 @@ from matplotlib.axes import Axes
 from mjx_walk.envs import TASKS
 from mjx_walk.logs.metrics import Row, read_rows, write_csv
 from mjx_walk.settings.saved_config import read_saved_config
-from mjx_walk.storage.files import replacing
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
-from mjx_walk.viewing.figures import standard_style
+from mjx_walk.viewing.figures import save_figure, standard_style
 
 __all__ = ["THOUSANDS", "evaluations", "learning_axes", "plot_run", "series"]
 
@@ -112,9 +111,7 @@ def _learning_curve(rows: list[Row], title: str, path: Path) -> Path:
     first = figure.axes[0]
     if first.get_legend_handles_labels()[0]:
         first.legend()
-    with replacing(path) as new:
-        figure.savefig(new, dpi=110)
-    return path
+    return save_figure(figure, path)
 
 
 def _marker(x: np.ndarray) -> str:
@@ -139,6 +136,4 @@ def _grid(rows: list[Row], names: list[str], title: str, path: Path) -> Path:
         axes.tick_params(labelsize=8, labelbottom=True)
         axes.grid(alpha=0.3)
     figure.supxlabel("million environment steps", fontsize=9)
-    with replacing(path) as new:
-        figure.savefig(new, dpi=110)
-    return path
+    return save_figure(figure, path)

@@ -118,7 +118,7 @@ def test_copies_and_attributes():
     assert envs.get_attr("dt") == (0.008, 0.008) and envs.call("get_body_com", "foot")[1].shape == (3,)
     envs.set_attr("note", ["a", "b"])
     assert envs.get_attr("note") == ("a", "b")
-    with pytest.raises(ValueError, match="3 values for 2 environments"):
+    with pytest.raises(ValueError, match="`3` values for 2 environments"):
         envs.set_attr("note", [1, 2, 3])
     before = envs.call("state_vector")
     envs.envs[1].set_state(*np.split(before[0] + 0.5, 2))

@@ -1,0 +1,52 @@
+"""What one Gymnasium environment and the vector environment share: parts, description and pickling."""
+
+from typing import Any
+
+import gymnasium
+import jax
+from gymnasium.envs.mujoco import MujocoEnv
+
+from mjx_walk.envs import State, TaskOptions
+from mjx_walk.envs.model_changes import ModelSnapshot
+from mjx_walk.envs.models import warn_of_changed_sources
+from mjx_walk.interop.gymnasium_programs import Programs, is_forked, make_programs
+from mjx_walk.interop.mujoco_attributes import make_gymnasium_env
+
+__all__ = ["CompiledEnv"]
+
+
+class CompiledEnv:
+    """Compiled programs of a task, and an environment of Gymnasium that draws and renders."""
+
+    _NOT_PICKLED: tuple[str, ...] = ("_gymnasium_env", "_snapshot", "_programs")
+
+    _options: TaskOptions
+    _physics: str
+    _rendering: dict[str, object]
+    _state: State | None
+    _programs: Programs
+    _gymnasium_env: MujocoEnv
+
+    def _build(self) -> None:
+        """Make the parts that are not pickled."""
+        if not is_forked():  # a vectorizer may first ask a worker for its spaces
+            self._programs = make_programs(self._options, self._physics)
+        self._gymnasium_env = make_gymnasium_env(self._options, self._rendering)
+        self._snapshot = ModelSnapshot(self._gymnasium_env.model)
+
+    def _describe(self) -> tuple[gymnasium.Space, gymnasium.Space]:
+        """Take over Gymnasium's metadata and render mode. Returns its observation and action space."""
+        env = self._gymnasium_env
+        self.metadata = env.metadata | {"render_fps": round(1.0 / env.dt)}
+        self.render_mode = env.render_mode
+        return env.observation_space, env.action_space
+
+    def __getstate__(self) -> dict[str, object]:
+        state = {name: jax.device_get(value) for name, value in vars(self).items() if name not in self._NOT_PICKLED}
+        return state | {"_sources": self._programs.task.model_sources}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        sources = state.pop("_sources")
+        vars(self).update(state)
+        self._build()
+        warn_of_changed_sources(self._programs.task.model_file, sources)
