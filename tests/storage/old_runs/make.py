@@ -1,6 +1,7 @@
-"""`python make.py OUT`: write a small run folder for each algorithm, with the results of resuming it.
+"""`python make.py OUT [EPISODES ALGO…]`: write a small run folder for algorithms, with the results of resuming it.
 
-The folders here were written by version 9c96b95, with that version's tree first on PYTHONPATH; settings have its names.
+An earlier version writes them, with its tree first on PYTHONPATH. Folders here are from 9c96b95, without scores, and
+from bc351bb, with that name at their end, and scored in two episodes. Settings have the names of 9c96b95.
 Each folder holds a run of two iterations and `expected.msgpack.gz`: the deterministic action for `OBSERVATION`, and all
 leaves after two more iterations.
 """
@@ -20,7 +21,7 @@ OBSERVATION = np.linspace(-1.0, 1.0, 17, dtype=np.float32)
 
 _COMMON = (
     *("env=walker2d", "physics=c", "hardware=cpu", "num_envs=2", "env.max_episode_steps=3", "updates_per_chunk=1"),
-    *("evaluation.num_envs=1", "evaluation.gymnasium_episodes=0", "checkpoint.every_chunks=1", "checkpoint.keep=1"),
+    *("evaluation.num_envs=1", "checkpoint.every_chunks=1", "checkpoint.keep=1"),
     *("algo.unroll_length=4", "algo.schedule_steps=1000", "algo.policy_hidden_layer_sizes=[4]"),
 )
 _ON_POLICY = (
@@ -44,12 +45,13 @@ _OWN = {
 }
 
 
-def main(out: Path) -> None:
+def main(out: Path, episodes: str = "0", *algos: str) -> None:
     from mjx_walk import load_run
     from mjx_walk.train import main as train
 
     os.chdir(out)  # the saved configurations name relative folders
-    for algo, own in _OWN.items():
+    for algo in algos or _OWN:
+        own = (*_OWN[algo], f"evaluation.gymnasium_episodes={episodes}")
         run, longer = Path(algo), Path(f"{algo}_longer")
         train([f"algo={algo}", *_COMMON, *own, f"run_dir={run}", "total_steps=16"])
         shutil.copytree(run, longer)
@@ -62,11 +64,11 @@ def main(out: Path) -> None:
         content = flax.serialization.msgpack_serialize(expected)
         (run / "expected.msgpack.gz").write_bytes(gzip.compress(content, mtime=0))
         shutil.rmtree(longer)
-        for path in [*run.glob("*.png"), *run.glob("events.*"), run / "metrics.csv"]:
+        for path in [*run.glob("*.png"), *run.glob("events.*"), *run.glob(".lock"), run / "metrics.csv"]:
             path.unlink()
         for path in run.rglob("commit_success.txt"):
             path.write_text("Checkpoint commit was successful")  # without the folder's absolute path
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), *sys.argv[2:])
