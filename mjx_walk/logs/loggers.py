@@ -8,7 +8,6 @@ import os
 import re
 import secrets
 import warnings
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -17,6 +16,7 @@ from mjx_walk.logs.metrics import Row, read_rows
 from mjx_walk.logs.tensorboard import EventFile
 from mjx_walk.settings.config import Config, flatten
 from mjx_walk.storage.checkpoint_metadata import Metadata
+from mjx_walk.storage.checksums import crc32
 from mjx_walk.storage.files import Appender, read_bytes, replacing, write_text
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
@@ -77,7 +77,7 @@ class MetricsWriter:
 
     def _count(self, line: bytes) -> None:
         self._num_rows += 1
-        self._checksum = zlib.crc32(line, self._checksum)
+        self._checksum = crc32(line, self._checksum)
 
     def _drop_later_rows(self, resume_steps: int, position: Metadata) -> None:
         lines = [_as_line(row) for row in read_rows(self._path) if row["env_steps"] <= resume_steps]

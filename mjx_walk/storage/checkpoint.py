@@ -5,7 +5,6 @@ newest step keeps its replay buffer, and each process writes its own folder.
 """
 
 import warnings
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, TypeVar
@@ -16,6 +15,7 @@ import numpy as np
 
 from mjx_walk.storage.arrays import HostArrays, read_arrays, write_arrays
 from mjx_walk.storage.checkpoint_metadata import FORMAT, Metadata, read_metadata, write_metadata
+from mjx_walk.storage.checksums import check_arrays, crc32
 from mjx_walk.storage.files import read_bytes, write_text
 from mjx_walk.storage.folders import discard, find_written, remove_unfinished, replacing_folder
 from mjx_walk.storage.saved_yaml import MAX_BYTES
@@ -79,7 +79,7 @@ def save(path: Path, tree: object, meta: Metadata, as_numpy: bool = False, confi
         OSError: writing failed, for example because the disk is full.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
-    meta = meta | {"crc32": {name: _crc32(x) for name, x in arrays.items()}}
+    meta = meta | {"crc32": {name: crc32(x) for name, x in arrays.items()}}
     replay = {name: x for name, x in arrays.items() if _is_replay(name)}
     with replacing_folder(path) as unfinished:
         rest = {name: x for name, x in arrays.items() if name not in replay}
@@ -88,7 +88,7 @@ def save(path: Path, tree: object, meta: Metadata, as_numpy: bool = False, confi
             write_arrays(unfinished / _REPLAY, replay, as_numpy)
         if config is not None:
             write_text(unfinished / _CONFIG, config)
-            meta[_CONFIG_CHECKSUM] = zlib.crc32(config.encode())
+            meta[_CONFIG_CHECKSUM] = crc32(config.encode())
         write_metadata(unfinished / _META, meta)
 
 
@@ -108,7 +108,7 @@ def config_copy(path: Path) -> Path | None:
         return None
     copy = path / _CONFIG
     try:
-        is_damaged = zlib.crc32(read_bytes(copy, MAX_BYTES)) != checksum
+        is_damaged = crc32(read_bytes(copy, MAX_BYTES)) != checksum
     except OSError as error:
         raise failed_read(path, error) from error
     except ValueError as error:
@@ -150,12 +150,12 @@ def restore(path: Path, like: _Tree) -> tuple[_Tree, Metadata]:
             warnings.warn(f"{path} has no replay buffer; training refills it before learning continues", stacklevel=2)
             empty = {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in wanted.items() if _is_replay(name)}
             arrays |= empty
-            meta["crc32"] |= {name: _crc32(array) for name, array in empty.items()}
+            meta["crc32"] |= {name: crc32(array) for name, array in empty.items()}
+    try:
+        check_arrays(wanted, arrays, meta["crc32"])
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
     for name, leaf in wanted.items():
-        if name in arrays and name not in meta["crc32"]:
-            raise ValueError(f"{path} is damaged: {name} has no checksum")
-        if name in meta["crc32"] and (name not in arrays or _crc32(arrays[name]) != meta["crc32"][name]):
-            raise ValueError(f"{path} is damaged: {name} does not match its checksum")
         if name not in arrays:
             raise UserError(
                 f"{path} belongs to another run or version: {name} should be {leaf.shape} {leaf.dtype}, found nothing"
@@ -267,10 +267,6 @@ def prune(folder: Path, max_to_keep: int) -> None:
 
 def _is_replay(name: str) -> bool:
     return name.startswith(f"{_REPLAY}.")
-
-
-def _crc32(array: np.ndarray) -> int:
-    return zlib.crc32(np.ascontiguousarray(array).view(np.uint8).data)
 
 
 def _named_leaves(tree: object) -> dict[str, jax.Array]:

@@ -69,8 +69,6 @@ def read_metadata(path: Path) -> Metadata:
         raise failed_read(path.parent, error) from error
     except ValueError as error:
         raise ValueError(f"{path.parent} is damaged: {path.name}: {error}") from error
-    if not isinstance(metadata, dict):
-        raise ValueError(f"{path} should be a JSON object, found {_shown(metadata)}")
     for name, (is_valid, valid) in _FACTS.items():
         if name in metadata and not is_valid(metadata[name]):
             raise ValueError(f"{path}: {name} should be {valid}, found {_shown(metadata[name])}")

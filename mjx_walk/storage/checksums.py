@@ -1,23 +1,55 @@
-"""JSON objects with a checksum, which reveals a change of the file. The file may come from an untrusted source."""
+"""Checksums of bytes, arrays and JSON objects, which reveal a change. Files may come from an untrusted source."""
 
 import json
 import zlib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from mjx_walk.storage.files import read_bytes
 
-__all__ = ["read_json", "take_checksum", "with_checksum"]
+__all__ = ["check_arrays", "crc32", "read_json", "take_checksum", "with_checksum"]
 
 _KEY = "checksum"
 _MAX_DEPTH = 20
 """Deepest nesting that is read. Python's JSON encoder supports far less nesting than its decoder."""
 
 
-def read_json(path: Path, max_bytes: int) -> object:
-    """Content of a JSON file.
+def crc32(data: bytes | np.ndarray, before: int = 0) -> int:
+    """Checksum of bytes or of an array's elements.
+
+    Args:
+        data: bytes, or an array of any dtype.
+        before: checksum of the data before these.
+    """
+    return zlib.crc32(data if isinstance(data, bytes) else np.ascontiguousarray(data).view(np.uint8).data, before)
+
+
+def check_arrays(names: Iterable[str], arrays: Mapping[str, np.ndarray], checksums: Mapping[str, int]) -> None:
+    """Check that arrays are those that were saved. A name that was not saved is not checked.
+
+    Args:
+        names: names of the arrays to check.
+        arrays: the arrays that were read, by name.
+        checksums: checksums of all arrays that were saved, by name.
 
     Raises:
-        ValueError: it is too large, nested too deeply, or not JSON in UTF-8.
+        ValueError: an array has no checksum, has another one, or was not read.
+    """
+    for name in names:
+        if name in arrays and name not in checksums:
+            raise ValueError(f"{name} has no checksum")
+        if name in checksums and (name not in arrays or crc32(arrays[name]) != checksums[name]):
+            raise ValueError(f"{name} does not match its checksum")
+
+
+def read_json(path: Path, max_bytes: int) -> dict[str, Any]:
+    """Content of a JSON file that holds an object.
+
+    Raises:
+        ValueError: it is too large, nested too deeply, no JSON in UTF-8, or no object.
         OSError: it is not a regular file, or cannot be read.
     """
     try:
@@ -26,6 +58,8 @@ def read_json(path: Path, max_bytes: int) -> object:
         raise ValueError("it is nested too deeply") from error
     if not _is_shallow(content, _MAX_DEPTH):
         raise ValueError("it is nested too deeply")
+    if not isinstance(content, dict):
+        raise ValueError("it is no JSON object")
     return content
 
 
@@ -45,7 +79,7 @@ def take_checksum(content: dict[str, object]) -> bool:
 
 
 def _checksum(content: dict[str, object]) -> int:
-    return zlib.crc32(json.dumps(content, sort_keys=True).encode())
+    return crc32(json.dumps(content, sort_keys=True).encode())
 
 
 def _is_shallow(value: object, depth: int) -> bool:

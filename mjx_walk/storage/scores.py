@@ -127,8 +127,6 @@ def read_scores(path: Path) -> ScoreFile:
         content = read_json(path, _MAX_BYTES)
     except ValueError as error:
         raise ValueError(f"{path} holds no scores: {error}") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path} holds no object")
     if not take_checksum(content):
         raise ValueError(f"{path} was changed after it was written: its checksum does not match")
     env = content.pop("env", "")
