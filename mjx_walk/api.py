@@ -188,7 +188,7 @@ def train(
             remember(configs[0].env.reward_function, task.reward_hashes)
         algorithm = _make_algorithm(configs[0], task, processes)
         folders, configs = _prepare(configs, algorithm, processes, closing, runs)
-        trainer = Trainer(configs, algorithm, folders, on_metrics, processes)
+        trainer = Trainer(configs, algorithm, folders, processes, on_metrics)
         with as_by_ctrl_c(), contextlib.closing(trainer):
             signal_name = trainer.train()
             if not signal_name:

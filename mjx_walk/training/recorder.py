@@ -1,8 +1,8 @@
-"""Write the metrics, checkpoints and policies of runs to their folders."""
+"""Write the metrics, checkpoints and policies of a run to its folder."""
 
 import contextlib
 import shlex
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from mjx_walk.algos import Algorithm, TrainState
 from mjx_walk.evaluation.saved_policies import best_policy
@@ -21,7 +21,7 @@ from mjx_walk.training.restoring import NUM_DEVICES, SEEDS_TOGETHER, device_fold
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import PolicyParams
 
-__all__ = ["Recorder", "Recorders", "reporting_failed_writes"]
+__all__ = ["Recorder", "reporting_failed_writes"]
 
 
 class Recorder:
@@ -58,13 +58,13 @@ class Recorder:
         self._writer: MetricsWriter | None = None
         self._wandb: WandbLog | None = None
 
-    def begin(self, env_steps: int, will_train: bool, restored: Metadata | None = None) -> None:
+    def begin(self, env_steps: int, will_train: bool, restored: Metadata) -> None:
         """Open the logs. Save the configuration of a resumed run.
 
         Args:
             env_steps: environment steps at which the run resumes; later rows are dropped.
             will_train: whether iterations follow; they invalidate an old score, which is then removed.
-            restored: metadata of the checkpoint from which the run resumes.
+            restored: metadata of the checkpoint from which the run resumes; empty for a new run.
         """
         if not self._processes.is_main_process:
             return
@@ -118,7 +118,7 @@ class Recorder:
             self._saver.save(Part(self._folder.policy(BEST), policy_params, metadata))
 
     def wait(self) -> None:
-        """Wait until the last save is complete."""
+        """Wait until the last save is complete. Before that, another run of the program may need the one before it."""
         with reporting_failed_writes(self._folder):
             self._saver.wait()
 
@@ -143,69 +143,6 @@ class Recorder:
             self.wait()
         finally:
             self.close_logs()
-
-
-class Recorders:
-    """Writes the folders of one or several runs. Arguments of several runs are in the order of the configurations.
-
-    Runs that train together, and the devices of one run, keep their newest checkpoints at the same step.
-    """
-
-    def __init__(self, configs: list[Config], algorithm: Algorithm, folders: list[RunFolder], processes: Processes):
-        """
-        Args:
-            configs: checked configurations that differ only in `seed` and `run_dir`.
-            algorithm: algorithm of one run, on one device.
-            folders: prepared run folders, one for each configuration.
-            processes: processes that train one run.
-        """
-        self._recorders = [
-            Recorder(config, algorithm, folder, processes, len(configs))
-            for config, folder in zip(configs, folders, strict=True)
-        ]
-
-    def begin(self, env_steps: int, will_train: bool, restored: list[Metadata]) -> None:
-        """Open the logs, as `Recorder.begin` does. `restored` is empty if no run resumes."""
-        for recorder, metadata in zip(self._recorders, restored or [Metadata()] * len(self._recorders), strict=True):
-            recorder.begin(env_steps, will_train, metadata)
-
-    def write(self, rows: list[Row]) -> None:
-        """Log a row of each run."""
-        for recorder, row in zip(self._recorders, rows, strict=True):
-            recorder.write(row)
-
-    def save(self, states: list[TrainState], are_finite: Iterable[bool], env_steps: int, wall_seconds: float) -> None:
-        """Start saving the states that are finite."""
-        for recorder, state, is_finite in zip(self._recorders, states, are_finite, strict=True):
-            if is_finite:
-                recorder.save(state, env_steps, wall_seconds)
-
-    def save_best(self, policies: list[tuple[PolicyParams, Metadata] | None]) -> None:
-        """Start saving policies as the best ones of their runs. None leaves a run's best policy as it is."""
-        for recorder, policy in zip(self._recorders, policies, strict=True):
-            if policy:
-                recorder.save_best(*policy)
-
-    def wait(self) -> None:
-        """Wait until the last save is complete in all folders. Before that, one may need the checkpoint before it."""
-        for recorder in self._recorders:
-            recorder.wait()
-
-    def prune(self) -> None:
-        """Remove old checkpoints and replay buffers."""
-        for recorder in self._recorders:
-            recorder.prune()
-
-    def close_logs(self) -> None:
-        """Close the logs of all runs."""
-        for recorder in self._recorders:
-            recorder.close_logs()
-
-    def close(self) -> None:
-        """Finish the checkpoints that are being written, and close the logs, however training has ended."""
-        with contextlib.ExitStack() as closing:
-            for recorder in self._recorders:
-                closing.callback(recorder.close)
 
 
 @contextlib.contextmanager

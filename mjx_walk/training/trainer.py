@@ -1,5 +1,6 @@
 """The host loop: call the compiled program, log, save, and score at the end."""
 
+import contextlib
 import logging
 import signal
 import time
@@ -23,7 +24,7 @@ from mjx_walk.training.call_profile import CallProfile
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.messages import end_lines, score_lines
 from mjx_walk.training.programs import compile_together, make_program
-from mjx_walk.training.recorder import Recorders, reporting_failed_writes
+from mjx_walk.training.recorder import Recorder, reporting_failed_writes
 from mjx_walk.training.restoring import restore_runs
 from mjx_walk.training.scoring import Policies, final_and_best, score_run
 from mjx_walk.utils.errors import UserError
@@ -43,23 +44,26 @@ class Trainer:
         configs: list[Config],
         algorithm: Algorithm,
         folders: list[RunFolder],
+        processes: Processes,
         on_metrics: Callable[[Row], None] | None = None,
-        processes: Processes | None = None,
     ):
         """
         Args:
             configs: checked configurations that differ only in `seed` and `run_dir`.
             algorithm: algorithm of one run, on one device.
             folders: prepared run folders, one for each configuration.
-            on_metrics: called with every logged row.
             processes: processes that train one run together, with `num_envs` environments each.
+            on_metrics: called with every logged row.
         """
         self._config = config = configs[0]
         self._algorithm = algorithm
         self._folders = folders
-        self._processes = processes = processes or Processes()
+        self._processes = processes
         self._program = make_program(algorithm, config.iterations_per_call, len(configs), processes)
-        self._recorders = Recorders(configs, algorithm, folders, processes)
+        self._recorders = [
+            Recorder(own, algorithm, folder, processes, seeds_together=len(configs))
+            for own, folder in zip(configs, folders, strict=True)
+        ]
         films = config.evaluation.films and processes.is_main_process
         self._filmers = [Filmer(*run) for run in zip(configs, folders, strict=True)] if films else []
         self._steps_per_iteration = algorithm.steps_per_iteration * processes.process_count
@@ -84,22 +88,24 @@ class Trainer:
             UserError: training has diverged, so that a network, an optimizer or a running statistic is not finite.
         """
         restored, metadata = self._restored()
-        call = metadata[0]["env_steps"] // self._steps_per_call if metadata else 0
+        call = metadata[0].get("env_steps", 0) // self._steps_per_call
         self._say_total(call)
-        progress = self._make_progress(call)
+        total_steps, is_main = self._num_calls * self._steps_per_call, self._processes.is_main_process
+        progress = Progress(total_steps, call * self._steps_per_call, is_main)
+        profile = CallProfile(self._folders[0].profile, self._config.profile_calls if is_main else 0)
         state = self._ready_to_call(restored, call)
         speed = Speed(call)
-        self._recorders.begin(call * self._steps_per_call, call < self._num_calls, metadata)
+        for recorder, facts in zip(self._recorders, metadata, strict=True):
+            recorder.begin(call * self._steps_per_call, call < self._num_calls, facts)
         saved_call, is_finite = call or -1, True
-        with Interrupt() as interrupt, self._make_profile() as profile:
+        with Interrupt() as interrupt, profile:
             signal_name = self._stop_signal(interrupt)
             while call < self._num_calls and is_finite and not signal_name:
                 profile.next_call()
                 state, metrics = self._program.step(state)
                 call += 1
                 rows = self._rows(call, metrics, speed)
-                self._recorders.write(rows)
-                self._report(rows)
+                self._log(rows)
                 self._film(state, rows)
                 progress.update(mean_row(rows))
                 is_finite = bool(self._program.is_finite(state).all())
@@ -138,14 +144,15 @@ class Trainer:
 
     def close(self) -> None:
         """Finish the checkpoints that are being written, and close the logs, however training has ended."""
-        with postponed("finishing the checkpoint"):
-            self._recorders.close()
+        with postponed("finishing the checkpoint"), contextlib.ExitStack() as closing:
+            for recorder in self._recorders:
+                closing.callback(recorder.close)
 
     def _restored(self) -> tuple[TrainState | None, list[Metadata]]:
-        """The saved TrainState and the metadata of each run, if they are saved."""
+        """The saved TrainState, if there is one, and the metadata of each run; empty for a new run."""
         restored = restore_runs(self._folders, self._algorithm, self._processes) if self._config.resume else []
         if not restored:
-            return None, []
+            return None, [Metadata()] * len(self._seeds)
         self._seconds_before = max(metadata["wall_seconds"] for _, metadata in restored)
         return self._program.merge([state for state, _ in restored]), [metadata for _, metadata in restored]
 
@@ -158,14 +165,6 @@ class Trainer:
             _LOGGER.info(f"The run has already completed its {steps:,} steps; to continue, give a larger total_steps")
         elif steps != total:
             _LOGGER.info(f"total_steps={total:,} is rounded up to {steps:,}: a call has {self._steps_per_call:,} steps")
-
-    def _make_progress(self, call: int) -> Progress:
-        total, done = self._num_calls * self._steps_per_call, call * self._steps_per_call
-        return Progress(total, done, self._processes.is_main_process)
-
-    def _make_profile(self) -> CallProfile:
-        num_calls = self._config.profile_calls if self._processes.is_main_process else 0
-        return CallProfile(self._folders[0].profile, num_calls)
 
     def _ready_to_call(self, restored: TrainState | None, call: int) -> TrainState:
         """The state for the next call, if there is one. Compiles the programs while the engine gets ready."""
@@ -197,8 +196,10 @@ class Trainer:
         }
         return [common | name_metrics(own, self._steps_per_iteration) | speeds for own in metrics]
 
-    def _report(self, rows: list[Row]) -> None:
-        """Warn of physics that failed, and hand the rows to the caller."""
+    def _log(self, rows: list[Row]) -> None:
+        """Log the rows, warn of physics that failed, and hand the rows to the caller."""
+        for recorder, row in zip(self._recorders, rows, strict=True):
+            recorder.write(row)
         for row in rows:
             for metric, warning in physics_warnings(row, self._steps_per_call).items():
                 if metric not in self._warned_of:
@@ -219,26 +220,33 @@ class Trainer:
     def _save(self, state: TrainState, call: int, progress: Progress) -> None:
         """Save the TrainState of every run that is finite."""
         progress.show_stage("saving")
-        self._recorders.wait()
+        for recorder in self._recorders:
+            recorder.wait()
         self._processes.wait_for_all()
-        states, are_finite = self._program.split(state), self._program.is_finite(state)
-        self._recorders.save(states, are_finite, call * self._steps_per_call, self._seconds())
+        states, are_finite, seconds = self._program.split(state), self._program.is_finite(state), self._seconds()
+        for recorder, own, is_finite in zip(self._recorders, states, are_finite, strict=True):
+            if is_finite:
+                recorder.save(own, call * self._steps_per_call, seconds)
 
     def _finish(self, state: TrainState, call: int, is_complete: bool) -> None:
         """Close the logs and draw the curves. After a complete training, choose the best policy of each run."""
-        self._recorders.close_logs()
+        for recorder in self._recorders:
+            recorder.close_logs()
         states = self._program.split(without_replay(state))
         if self._processes.is_main_process:
             self._draw_curves()
         if self._processes.is_main_process and is_complete:
             env_steps = call * self._steps_per_call
             self._policies = final_and_best(self._algorithm, states, self._seeds, env_steps, self._steps_per_iteration)
-            self._recorders.save_best([own[BEST] if own[BEST] is own[FINAL] else None for own in self._policies])
+            for recorder, policies in zip(self._recorders, self._policies, strict=True):
+                if policies[BEST] is policies[FINAL]:
+                    recorder.save_best(*policies[BEST])
         if is_complete and len(self._folders) * self._processes.process_count == 1:
             return  # a single folder is saved while the policies are scored
         self._wait_for_files()
         self._processes.wait_for_all()
-        self._recorders.prune()
+        for recorder in self._recorders:
+            recorder.prune()
 
     def _draw_curves(self) -> None:
         from mjx_walk.viewing.run_plots import plot_run  # imports Matplotlib, which slows the start
@@ -260,7 +268,8 @@ class Trainer:
 
     def _wait_for_files(self) -> None:
         """Wait until all checkpoints and films are on disk."""
-        self._recorders.wait()
+        for recorder in self._recorders:
+            recorder.wait()
         for filmer in self._filmers:
             filmer.wait()
 

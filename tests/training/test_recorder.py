@@ -179,7 +179,7 @@ ROW = {"env_steps": 4, "wall_seconds": 1.0}
 
 def test_a_folder_that_vanishes_stops_the_run_and_is_not_made_again(run):
     recorder, _, state, folder = run
-    recorder.begin(0, will_train=True)
+    recorder.begin(0, will_train=True, restored={})
     recorder.write(ROW)
     shutil.rmtree(folder.path)
     says = f"{folder.path} has vanished with everything saved in it"
