@@ -98,4 +98,4 @@ def batch_once(batch_fn: Callable[_Arguments, _Outputs]) -> Callable[_Arguments,
         out = on_batch(*jax.tree.map(lambda x: jnp.expand_dims(x, 0), args))
         return jax.tree.map(lambda x: jnp.squeeze(x, 0), out)
 
-    return on_one
+    return on_one  # type: ignore[return-value]  # there are no keyword arguments
