@@ -70,7 +70,7 @@ class Humanoid(HealthyBody, HumanoidBody):
         velocity = (carry["mass_center"][0] - before.memory["mass_center"][0]) / self.dt
         forward = options.forward_reward_weight * velocity
         control = -options.ctrl_cost_weight * jnp.square(action).sum()
-        values = (survive, forward, control)
+        values: tuple[Array, ...] = (survive, forward, control)
         if options.version == "v5":
             contact = -self.contact_cost(derived, options.contact_cost_weight, options.contact_cost_range)
             values = (*values, contact)

@@ -25,7 +25,7 @@ class PlanarBody(Body):
     """A body in the plane of x and z, whose first coordinates are x, z and the torso's angle. It runs forward."""
 
     HAS_Y = False
-    HEIGHT_INDEX = 1
+    HEIGHT_INDEX: int | None = 1
     NUM_PLACE_COORDINATES = 1
 
     options: PlanarBodyOptions

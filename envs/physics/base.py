@@ -85,29 +85,17 @@ def batch_once(batch_fn: Callable[_Arguments, _Outputs]) -> Callable[_Arguments,
 
     @on_batch.def_vmap
     def _(axis_size, in_batched, *args):
-        args = _broadcast(axis_size, in_batched, args)
-        merged = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), args)
-        out = on_batch(*merged)
+        args = jax.tree.map(
+            lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (axis_size, *jnp.shape(x))),
+            args,
+            tuple(in_batched),
+        )
+        out = on_batch(*jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), args))
         out = jax.tree.map(lambda x: x.reshape((axis_size, -1, *x.shape[1:])), out)
         return out, jax.tree.map(lambda _: True, out)
 
-    @custom_vmap
     def on_one(*args):
-        out = on_batch(*jax.tree.map(lambda x: x[None], args))
-        return jax.tree.map(lambda x: x[0], out)
+        out = on_batch(*jax.tree.map(lambda x: jnp.expand_dims(x, 0), args))
+        return jax.tree.map(lambda x: jnp.squeeze(x, 0), out)
 
-    @on_one.def_vmap
-    def _(axis_size, in_batched, *args):
-        out = on_batch(*_broadcast(axis_size, in_batched, args))
-        return out, jax.tree.map(lambda _: True, out)
-
-    return on_one
-
-
-def _broadcast(axis_size: int, in_batched, args):
-    """Arguments with the batch axis added where `vmap` did not map it."""
-    return jax.tree.map(
-        lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (axis_size, *jnp.shape(x))),
-        args,
-        tuple(in_batched),
-    )
+    return on_one  # type: ignore[return-value]  # there are no keyword arguments

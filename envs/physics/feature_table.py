@@ -34,8 +34,11 @@ class Feature(NamedTuple):
 
     def users(self, model: mujoco.MjModel) -> Iterator[str]:
         """The elements of a model that use the feature, as `kind 'name'`."""
-        for user in self.find(model) if self.kind is None else np.flatnonzero(self.find(model)):
-            yield user if self.kind is None else name_of(model, self.kind, int(user))
+        found = self.find(model)
+        if isinstance(found, np.ndarray):
+            assert self.kind is not None
+            found = [name_of(model, self.kind, int(i)) for i in np.flatnonzero(found)]
+        yield from found
 
 
 class FeatureTable(list[Feature]):

@@ -1,6 +1,7 @@
 """A task as a `brax.envs.Env`, for Brax's wrappers and trainers and for algorithms written against them."""
 
 import dataclasses
+import functools
 import operator
 from typing import Any
 
@@ -71,7 +72,6 @@ class BraxEnv(base.Env):
         if "max_episode_steps" in keywords:
             raise UserError("BraxEnv has no time limit; give episode_length=N to Brax's EpisodeWrapper or wrap instead")
         self._task = make_env(env, physics, **keywords | {"max_episode_steps": NO_TIME_LIMIT})
-        self._own_sys: System | None = None
         self._changed_sys: System | None = None
 
     @property
@@ -90,18 +90,14 @@ class BraxEnv(base.Env):
         Raises:
             UserError: on setting a changed one with another engine, or with a change that the physics does not read.
         """
-        if self._changed_sys is not None:
-            return self._changed_sys
-        if self._own_sys is None:
-            with jax.ensure_compile_time_eval(), standard_dtypes():
-                sys = mjcf.load_model(with_newton_solver(self._task.model))
-                limits = jnp.tile(jnp.float32([-1.0, 1.0]), (self._task.action_size, 1))
-                self._own_sys = sys.replace(actuator=sys.actuator.replace(ctrl_range=limits))
-        return self._own_sys
+        return self._own_sys if self._changed_sys is None else self._changed_sys
 
     @sys.setter
     def sys(self, sys: System) -> None:
-        own = dict(jax.tree_util.tree_leaves_with_path(self._restored_sys()))
+        if self._changed_sys is not None:
+            self._change_model({})
+            self._changed_sys = None
+        own = dict(jax.tree_util.tree_leaves_with_path(self._own_sys))
         leaves = jax.tree_util.tree_leaves_with_path(sys)
         changes = {_dotted(path): leaf for path, leaf in leaves if leaf is not own.get(path)}
         if not changes:
@@ -111,11 +107,12 @@ class BraxEnv(base.Env):
         self._change_model(changes)
         self._changed_sys = sys
 
-    def _restored_sys(self) -> System:
-        if self._changed_sys is not None:
-            self._change_model({})
-            self._changed_sys = None
-        return self.sys
+    @functools.cached_property
+    def _own_sys(self) -> System:
+        with jax.ensure_compile_time_eval(), standard_dtypes():
+            sys = mjcf.load_model(with_newton_solver(self._task.model))
+            limits = jnp.tile(jnp.float32([-1.0, 1.0]), (self._task.action_size, 1))
+            return sys.replace(actuator=sys.actuator.replace(ctrl_range=limits))
 
     def _change_model(self, changes: dict[str, jax.Array]) -> None:
         engine: Any = self._task.engine
