@@ -76,7 +76,7 @@ def _of_one_seed(row: dict[str, str]) -> Best:
         score=row["final_mean"],
         std_over_seeds="",
         std_over_episodes=row["std"],
-        seeds="one seed",
+        seeds="1",
         million_steps=f"{int(row['steps']) / 1e6:.1f}",
         seconds=row["seconds"],
         shared_with=shared_with,
