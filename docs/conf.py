@@ -46,7 +46,7 @@ _ROOT_PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md"}
 
 
 def _link_from(folder: str, docname: str, target: str) -> str:
-    """A link of a Markdown file, as it must read in a page of the site.
+    """A link of a Markdown file, rewritten for a page of the site.
 
     Args:
         folder: of the Markdown file, relative to the repository.

@@ -31,7 +31,7 @@ def cells(page):
 
 
 def test_readme_shows_the_best_recipe_of_each_task():
-    """The scores of several seeds, or else the highest one of a single seed, which says so."""
+    """The scores of several seeds, or else the highest one of a single seed, which the table says."""
     shown = [row for row in cells("README.md") if row[0] in REFERENCES]
     assert [row[0] for row in shown] == list(REFERENCES)
     log = [row for row in read("experiments.csv") if re.fullmatch(r"(MS|PT)\d+", row["id"])]
@@ -41,7 +41,7 @@ def test_readme_shows_the_best_recipe_of_each_task():
         scores = [float(row["score"]) for row in of_task] or [float(row["final_mean"]) for row in one_seed]
         assert float(score.replace(",", "")) == pytest.approx(max(scores), rel=2e-3)
         assert algorithm.lower() in {row["algorithm"].lower() for row in of_task or one_seed}
-        assert (seeds == "one seed") == (not of_task)
+        assert (seeds == "1") == (not of_task)
 
 
 def test_readme_compares_with_the_highest_published_scores():

@@ -1,4 +1,4 @@
-"""Tables of the best recipe of each task, and of what others have published on it."""
+"""Tables of the best recipe of each task, next to the published scores."""
 
 import re
 from typing import NamedTuple
@@ -11,7 +11,7 @@ _ONE_SEED = {
     "MS": ("csac", "at most 5 other runs"),
     "PT": ("PPO", "1 other run"),
 }
-"""Arms of one seed on every task, by the letters of their ids: the algorithm, and what else the GPU trains."""
+"""Arms of one seed on every task, by the letters of their ids: the algorithm, and other trainings on the GPU."""
 _DASH = "–"
 
 
@@ -29,7 +29,7 @@ class Best(NamedTuple):
     seconds: str
     """Training time, of all seeds of a process."""
     shared_with: str
-    """What else trains on the GPU at the same time."""
+    """Other trainings on the GPU at the same time."""
     command: str
 
 
@@ -76,7 +76,7 @@ def _of_one_seed(row: dict[str, str]) -> Best:
         score=row["final_mean"],
         std_over_seeds="",
         std_over_episodes=row["std"],
-        seeds="one seed",
+        seeds="1",
         million_steps=f"{int(row['steps']) / 1e6:.1f}",
         seconds=row["seconds"],
         shared_with=shared_with,

@@ -1,4 +1,4 @@
-"""Tables of the files in measured/: speeds, times, memory, scores on a CPU, and those of the archive.
+"""Tables of the files in measured/: speeds, times, memory, scores on a CPU, and the tables of the archive.
 
 A file has a table's titles and rows. An empty cell was not measured.
 """

@@ -1,4 +1,4 @@
-"""What each number of a task's observation is, found by observing states whose numbers are known."""
+"""Meaning of each number of a task's observation, found by observing states whose numbers are known."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from mjx_walk.envs import Task
 from mjx_walk.envs.physics import PhysicsState
 
 Name = tuple[str, str]
-"""What a number is, and its unit."""
+"""Meaning of a number, and its unit."""
 
 _FREE_POSITION = [*((f"{axis} of", "m") for axis in "xyz"), *((f"quaternion {axis} of", "") for axis in "wxyz")]
 _FREE_VELOCITY = [
@@ -51,7 +51,7 @@ def joint_forces(model: mujoco.MjModel, what: str) -> list[Name]:
 
 
 def _of_joints(model: mujoco.MjModel, free: list[Name], slide: Name, hinge: Name) -> list[Name]:
-    """Names of the elements that free joints, sliders and hinges have, with the joint's name behind each."""
+    """Names of the elements that free joints, sliders and hinges have, each with the joint's name."""
     kinds = {mujoco.mjtJoint.mjJNT_FREE: free, mujoco.mjtJoint.mjJNT_SLIDE: [slide]}
     names: list[Name] = []
     for joint in map(model.joint, range(model.njnt)):

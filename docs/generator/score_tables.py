@@ -28,7 +28,7 @@ def highest_published(task: str, several_seeds: bool = True) -> dict[str, str] |
 
 
 def published(several_seeds: bool) -> str:
-    """What others have published: means over several seeds, or single runs."""
+    """Published scores: means over several seeds, or single runs."""
     seeds = (">Seeds",) if several_seeds else ()
     titles = ("Task", "Algorithm", ">Score", ">Std", *seeds, ">Steps (M)", "Policy", "Date", "Source")
     rows = [

@@ -78,7 +78,7 @@ def six_algorithms() -> str:
 
 
 def ppo_on_other_tasks() -> str:
-    """One seed of PPO on the tasks whose recipes are a start."""
+    """One seed of PPO on the tasks with untuned recipes."""
     log, rows = _log(), []
     for arm in _PPO:
         row = log[arm]

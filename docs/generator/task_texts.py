@@ -1,4 +1,4 @@
-"""What task pages say in words: starts, reward terms, terminations and the differences of v4.
+"""Words of the task pages: starts, reward terms, terminations and the differences of v4.
 
 The code has these as arithmetic. A test checks that every reward term of every version has its words here.
 """
