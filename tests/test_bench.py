@@ -12,13 +12,11 @@ from helpers import TINY_OFF_POLICY, command, command_here
 
 from mjx_walk.bench import device_counts
 from mjx_walk.experiments import scaling, timing
-from mjx_walk.experiments.program_costs import matmul_flops, reduced_bytes
 from mjx_walk.experiments.recorded_time import read_device_time
 from mjx_walk.experiments.scaling import share_of_total
 from mjx_walk.machine.subprocesses import start_module
 from mjx_walk.settings.config import load_config
 from mjx_walk.training.call_profile import CallProfile
-from mjx_walk.utils import collectives
 from mjx_walk.utils.errors import UserError
 
 
@@ -29,14 +27,8 @@ def test_bench_measures_and_writes(tmp_path):
     assert done.returncode == 0, done.stderr
     content = json.loads((tmp_path / "bench.json").read_text())
     results = content["results"]
-    speeds = ("Gymnasium, one core", "physics only", "physics, observation and reward", "training")
-    assert all(results[name] > 100 for name in speeds)
-    for part, limit in (("collecting", "physics alone"), ("learning", "matrix products alone")):
-        assert results[f"an iteration: {part}"] > 0 and results[f"  of which {limit} would take"] > 0
-    inserts = [value for name, value in results.items() if name.startswith("insert of 4,096 transitions")]
-    assert len(inserts) == 2 and all(value > 0 for value in inserts)
+    assert results["training"] > 100
     assert all(results[f"compile and first call, {name} caches"] > 0 for name in ("cold", "warm"))
-    assert results["peak memory, host"] > 0.1
     assert content["env"] == "Walker2d-v5" and content["versions"]["mujoco"] and "32 environments" in content["device"]
 
 
@@ -56,7 +48,6 @@ def test_speeds_are_compared_with_one_device_s(monkeypatch):
     assert [results[f"training, {name} environments"] for name in ("1 x 32", "2 x 32", "2 x 16")] == [100, 180, 120]
     assert results["  2 x 32 environments: times one device"] == 1.8
     assert results["  2 x 16 environments: times one device"] == 1.2
-    assert results["data to reduce in an iteration, per device"] > 0
 
 
 @pytest.mark.slow
@@ -146,36 +137,3 @@ def test_calls_are_recorded_from_the_third_one_on(tmp_path):
         read_device_time(tmp_path / "none")
     recorded = read_device_time(tmp_path / "one")
     assert 0 < recorded.total <= times[2] and recorded.reductions == recorded.physics == 0
-
-
-def test_reduced_data_are_counted():
-    """The gradient of one layer, in each of two updates; a mean of one number."""
-
-    class OneLayer:
-        def state_shapes(self):
-            return jax.ShapeDtypeStruct((3, 5), jnp.float32)
-
-        def collect(self, state):
-            return state, jnp.zeros((7, 3))
-
-        def learn(self, state, batch):
-            def update(weights, _):
-                grads = jax.grad(lambda weights: jnp.square(batch @ weights).mean())(weights)
-                return weights - collectives.mean(grads, collectives.DEVICES), None
-
-            state, _ = jax.lax.scan(update, state, length=2)
-            return state, collectives.total(state.sum(), collectives.DEVICES)
-
-    assert reduced_bytes(OneLayer(), 4) == 4 * (2 * 3 * 5 + 1)
-
-
-def test_products_are_counted():
-    """By hand: 2·m·k·n each; ten times in a loop; the larger of two branches; twice in the gradient of a vector."""
-    a, b, v = jnp.zeros((3, 5)), jnp.zeros((5, 7)), jnp.zeros(5)
-    assert matmul_flops(lambda a, b: a @ b, a, b) == 2 * 3 * 5 * 7
-    assert matmul_flops(jax.vmap(lambda v, b: v @ b, (0, None)), a, b) == 2 * 3 * 5 * 7
-    loop = jax.jit(lambda a: jax.lax.scan(lambda c, _: (c + a @ b @ b.T, None), a, length=10)[0])
-    assert matmul_flops(loop, a) == 10 * 2 * (2 * 3 * 5 * 7)
-    branch = lambda c: jax.lax.cond(c, lambda: (a @ b)[0, 0], lambda: 0.0)  # noqa: E731
-    assert matmul_flops(branch, True) == 2 * 3 * 5 * 7
-    assert matmul_flops(jax.grad(lambda b: jnp.tanh(v @ b).sum()), b) == 2 * (2 * 5 * 7)

@@ -8,16 +8,12 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple
 
-from mjx_walk.algos import make_algorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
-from mjx_walk.evaluation.saved_policies import make_task
-from mjx_walk.experiments.program_costs import reduced_bytes
 from mjx_walk.experiments.recorded_time import read_device_time
 from mjx_walk.experiments.timing import Measurement, training
 from mjx_walk.logs.metrics import Row
 from mjx_walk.settings.config import Config
 from mjx_walk.training.call_profile import CALLS_BEFORE
-from mjx_walk.utils.collectives import DEVICES
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["Speed", "measure", "measure_speed", "share_of_total"]
@@ -63,13 +59,6 @@ def measure(overrides: list[str], config: Config, sizes: list[int], seconds: flo
         yield from _speeds(name, speed, alone if size > 1 else None)
     for name, size, arguments in variants:
         yield from _parts(name, arguments, size)
-    if shares:
-        # Only now, because this process would allocate the devices' memory.
-        algorithm = make_algorithm(
-            make_task(config), config.num_envs, config.evaluation, config.algo, axis_name=DEVICES
-        )
-        megabytes = reduced_bytes(algorithm, max(sizes)) / 1e6
-        yield Measurement("data to reduce in an iteration, per device", megabytes, "MB")
 
 
 def share_of_total(config: Config, size: int) -> list[str]:

@@ -11,6 +11,7 @@ from brax.training.agents.ppo import networks as brax_networks
 from brax.training.agents.ppo import train as brax_ppo
 from brax.training.agents.ppo.losses import PPONetworkParams
 from helpers import OPTIMIZED, slow_except, values
+from peers import restore_device_put_replicated
 from toy_tasks import BraxSizes, ConstantReward, EndlessReward
 
 from mjx_walk.algos.on_policy import _make_optimizer
@@ -19,7 +20,6 @@ from mjx_walk.algos.ppo import PPO, PPOConfig
 from mjx_walk.common import networks, returns
 from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.envs import make_env
-from mjx_walk.experiments.peers import restore_device_put_replicated
 
 SMALL = PPOConfig(
     unroll_length=8,

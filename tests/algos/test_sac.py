@@ -9,6 +9,7 @@ from brax.training import acting
 from brax.training.agents.sac import networks as brax_networks
 from brax.training.agents.sac import train as brax_sac
 from helpers import values
+from peers import restore_device_put_replicated
 from toy_tasks import BraxSizes, ToyTask
 
 from mjx_walk.algos.off_policy_state import Batch
@@ -16,7 +17,6 @@ from mjx_walk.algos.sac import SAC, SACConfig
 from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.common.replay_buffer import ReplayBuffer
 from mjx_walk.envs import make_env
-from mjx_walk.experiments.peers import restore_device_put_replicated
 from mjx_walk.utils.types import Transition
 
 NUM_ENVS, BATCH, UPDATES = 16, 32, 5

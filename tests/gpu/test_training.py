@@ -6,8 +6,8 @@ import signal
 import time
 
 import pytest
-from gpu_gate import checked_rows, finish, run, start
-from helpers import wait_for_line
+from gpu_gate import checked_rows, finish, run, run_python, start
+from helpers import CLONE, wait_for_line
 
 from mjx_walk.settings.config import load_config
 from mjx_walk.storage import checkpoint
@@ -62,6 +62,13 @@ def test_bench_of_two_gpus(record_property):
 
 def test_bench(record_property):
     printed = run("bench", "env=walker2d", "algo=ppo", "seconds=1")
+    (line,) = [line for line in printed.splitlines() if "steps/s" in line]
+    record_property("measured", " ".join(line.split()))
+
+
+def test_parts_of_training(record_property):
+    program = (CLONE / "benchmarks" / "training_parts.py").read_text()
+    printed = run_python(program, "env=walker2d", "algo=ppo", "seconds=1", cwd=CLONE / "benchmarks")
     lines = [line for line in printed.splitlines() if "steps/s" in line]
     assert len(lines) >= 3
     record_property("measured", "; ".join(" ".join(line.split()) for line in lines))

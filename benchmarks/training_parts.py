@@ -1,4 +1,7 @@
-"""Speed of training's parts in this process, against what physics and matrix products alone would take."""
+"""`python benchmarks/training_parts.py env=humanoid`: speeds of training's parts, next to Gymnasium's.
+
+Collecting and learning stand next to what physics and matrix products alone would take.
+"""
 
 import dataclasses
 import functools
@@ -11,24 +14,63 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 from gymnasium.utils.performance import benchmark_step
+from program_costs import learning_flops, reduced_bytes
 
 from mjx_walk.algos import Algorithm, TrainState, make_algorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
+from mjx_walk.api import resolve
+from mjx_walk.bench import describe_device, show, write
+from mjx_walk.cli import parsing
 from mjx_walk.common.replay_buffer import ReplayBuffer, Steps
 from mjx_walk.envs import Task
 from mjx_walk.envs.physics import make_engine
-from mjx_walk.experiments.program_costs import learning_flops
+from mjx_walk.evaluation.saved_policies import make_task
 from mjx_walk.experiments.timing import Measurement
 from mjx_walk.machine.devices import default_device
 from mjx_walk.settings.config import Config
+from mjx_walk.settings.overrides import key_of_value
+from mjx_walk.storage.files import user_path
 from mjx_walk.training.programs import make_init, make_step
+from mjx_walk.utils.collectives import DEVICES
+from mjx_walk.utils.setting_fields import setting
 from mjx_walk.utils.types import Metrics, PyTree, as_means
 from mjx_walk.viewing.episode import make_gymnasium
 
-__all__ = ["matmul_speed", "measure", "time_parts"]
+__all__ = ["USAGE", "Arguments", "main", "matmul_speed", "measure", "time_parts"]
+
+USAGE = """
+usage: python benchmarks/training_parts.py [env=humanoid] [algo=ppo] [KEY=VALUE ...] [seconds=5] [out=parts.json]
+
+  KEY=VALUE  as for train: physics=jax num_envs=2048 algo.num_epochs=4; by default the recipe for this hardware
+  seconds    least time to measure each speed
+  out        write the table as JSON, with package versions
+"""
 
 _STEPS_PER_CALL = 25
 """About as long as a random policy keeps a humanoid upright. Every call starts from resets, like real episodes."""
+
+
+@dataclasses.dataclass
+class Arguments:
+    """Arguments that are not settings of the training."""
+
+    seconds: float = setting(5.0, above=0)
+    out: str | None = None
+
+
+def main(command_line: list[str]) -> None:
+    """Measure, print a table, and write JSON if asked."""
+    arguments, overrides = parsing.parse_own(Arguments, Config, command_line, USAGE, key_of_value)
+    config = resolve(overrides)
+    jax.config.update("jax_default_matmul_precision", config.matmul_precision)
+    if arguments.out:
+        parsing.check_writable(user_path(arguments.out))
+    task = make_task(config)
+    device = describe_device(task, config)
+    print(f"{task.gymnasium_id} on {device}", flush=True)
+    results = show(measure(config, task, arguments.seconds))
+    if arguments.out:
+        write(arguments.out, task.gymnasium_id, device, results)
 
 
 def measure(config: Config, task: Task, seconds: float) -> Iterator[Measurement]:
@@ -54,6 +96,7 @@ def measure(config: Config, task: Task, seconds: float) -> Iterator[Measurement]
     yield Measurement("training", training, "env-steps/s")
     yield Measurement("training / Gymnasium on one core", training / on_one_core, "times")
     yield from _iteration_times(config, algorithm, fused, physics, seconds)
+    yield Measurement("data to reduce in an iteration, per device", _reduced_bytes(config, task) / 1e6, "MB")
     yield from _peak_memory()
     if isinstance(config.algo, OffPolicyConfig):
         yield from _insert_times(task)
@@ -143,6 +186,12 @@ def time_parts(algorithm: Algorithm, iterations_per_call: int, fused: bool, seco
     return collecting / iterations_per_call, learning
 
 
+def _reduced_bytes(config: Config, task: Task) -> float:
+    """Bytes that each device gives to the reductions over several devices in one iteration."""
+    algorithm = make_algorithm(task, config.num_envs, config.evaluation, config.algo, axis_name=DEVICES)
+    return reduced_bytes(algorithm, num_devices=2)
+
+
 def _read_batch(state: TrainState, batch: PyTree) -> tuple[TrainState, Metrics]:
     """Stand in for `learn`: read the batch, so that the compiler keeps it."""
     total = jnp.stack([jnp.sum(x, dtype=jnp.float32) for x in jax.tree.leaves(batch)]).sum()
@@ -184,3 +233,7 @@ def _peak_memory() -> Iterator[Measurement]:
     stats = default_device().memory_stats()
     if stats:
         yield Measurement("peak memory, device (JAX)", stats["peak_bytes_in_use"] / 2**30, "GiB")
+
+
+if __name__ == "__main__":
+    parsing.main(main)

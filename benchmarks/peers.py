@@ -1,5 +1,6 @@
-"""Brax's trainers, measured with Brax's own code for comparison with ours."""
+"""`python benchmarks/peers.py algo=ppo`: speed of Brax's trainer on Brax's own, reduced humanoid."""
 
+import dataclasses
 import functools
 import time
 from collections.abc import Iterator
@@ -13,14 +14,41 @@ from brax.training.agents.sac import networks as sac_networks
 from brax.training.agents.sac import train as sac
 
 from mjx_walk.algos.sac import SAC, SACConfig
+from mjx_walk.api import resolve
+from mjx_walk.bench import show, write
+from mjx_walk.cli import parsing
 from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.envs import State, TaskOptions, TrainableTask
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.experiments.timing import Measurement
+from mjx_walk.machine.devices import default_device
+from mjx_walk.settings.config import Config
+from mjx_walk.settings.overrides import key_of_value
+from mjx_walk.storage.files import user_path
 from mjx_walk.training.programs import make_init, make_step
+from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import PyTree
 
-__all__ = ["BraxTask", "brax_ppo_speed", "brax_sac_speed", "measure", "restore_device_put_replicated", "sac_speed"]
+__all__ = [
+    "USAGE",
+    "Arguments",
+    "BraxTask",
+    "brax_ppo_speed",
+    "brax_sac_speed",
+    "main",
+    "measure",
+    "restore_device_put_replicated",
+    "sac_speed",
+]
+
+USAGE = """
+usage: python benchmarks/peers.py [algo=ppo|sac] [hardware=gpu|cpu] [KEY=VALUE ...] [out=peers.json]
+
+  algo       Brax's PPO, or Brax's SAC next to ours; each takes some minutes, mostly to compile
+  hardware   cpu or gpu, the size of the training; by default this machine's
+  KEY=VALUE  as for train; of them only matmul_precision has an effect
+  out        write the table as JSON, with package versions
+"""
 
 _UNROLL_LENGTH = 10
 _EPISODE_LENGTH = 1000
@@ -28,6 +56,29 @@ _SAC_SIZES: dict[str, dict[str, Any]] = {
     "gpu": {"batch_size": 512, "grad_updates_per_step": 8, "replay_capacity": 1_000_000, "learning_starts": 1_000_000},
     "cpu": {"batch_size": 64, "grad_updates_per_step": 4, "replay_capacity": 20_000, "learning_starts": 20_000},
 }
+
+
+@dataclasses.dataclass
+class Arguments:
+    """Arguments that are not settings of a training."""
+
+    out: str | None = None
+
+
+def main(command_line: list[str]) -> None:
+    """Measure, print a table, and write JSON if asked."""
+    arguments, overrides = parsing.parse_own(Arguments, Config, command_line, USAGE, key_of_value)
+    config = resolve(overrides)
+    if config.algo.name not in ("ppo", "sac"):
+        raise UserError(f"Brax has no {config.algo.name} to compare with; choose algo=ppo or algo=sac")
+    jax.config.update("jax_default_matmul_precision", config.matmul_precision)
+    if arguments.out:
+        parsing.check_writable(user_path(arguments.out))
+    device = default_device().device_kind
+    print(f"Brax's humanoid on {device}", flush=True)
+    results = show(measure(config.algo.name, config.hardware))
+    if arguments.out:
+        write(arguments.out, "Brax's humanoid", device, results)
 
 
 def measure(algo: str, hardware: str) -> Iterator[Measurement]:
@@ -179,3 +230,7 @@ def brax_sac_speed(env: brax.envs.Env, num_envs: int, config: SACConfig, num_ste
         progress_fn=lambda _, metrics: speeds.append(float(metrics.get("training/sps", 0.0))),
     )
     return speeds[-1] / num_envs * config.grad_updates_per_step
+
+
+if __name__ == "__main__":
+    parsing.main(main)

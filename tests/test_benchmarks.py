@@ -1,0 +1,92 @@
+"""The programs of `benchmarks` run, and count what they report."""
+
+import json
+import re
+import runpy
+import sys
+
+import jax
+import jax.numpy as jnp
+import pytest
+from helpers import CLONE, PAGES, TINY_OFF_POLICY
+from program_costs import matmul_flops, reduced_bytes
+
+from mjx_walk.utils import collectives
+
+
+def exit_code(name, *arguments):
+    """Exit code of `python benchmarks/NAME ARGUMENTS`, run in this process."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(sys, "argv", [name, *arguments])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(CLONE / "benchmarks" / name), run_name="__main__")
+    return ended.value.code
+
+
+def test_programs_that_the_documentation_names_are_there(capsys):
+    named = {name for text in PAGES.values() for name in re.findall(r"python benchmarks/(\S+\.py)", text)}
+    assert named == {"peers.py", "training_parts.py"}
+    for name in named:
+        assert exit_code(name, "--help") == 0
+        assert capsys.readouterr().out.startswith(f"usage: python benchmarks/{name} ")
+
+
+@pytest.mark.slow
+def test_the_parts_of_training_are_measured_and_written(tmp_path):
+    arguments = ("algo=td3", *TINY_OFF_POLICY, "num_envs=32", "seconds=0.5", f"out={tmp_path}/parts.json")
+    assert exit_code("training_parts.py", *arguments) == 0
+    content = json.loads((tmp_path / "parts.json").read_text())
+    results = content["results"]
+    speeds = ("Gymnasium, one core", "physics only", "physics, observation and reward", "training")
+    assert all(results[name] > 100 for name in speeds)
+    for part, limit in (("collecting", "physics alone"), ("learning", "matrix products alone")):
+        assert results[f"an iteration: {part}"] > 0 and results[f"  of which {limit} would take"] > 0
+    inserts = [value for name, value in results.items() if name.startswith("insert of 4,096 transitions")]
+    assert len(inserts) == 2 and all(value > 0 for value in inserts)
+    assert results["peak memory, host"] > 0.1 and results["data to reduce in an iteration, per device"] > 0
+    assert content["env"] == "Walker2d-v5" and content["versions"]["mujoco"] and "32 environments" in content["device"]
+
+
+@pytest.mark.parametrize(
+    ("name", "argument", "message"),
+    [
+        ("peers.py", "algo=td3", "Brax has no td3 to compare with; choose algo=ppo or algo=sac"),
+        ("training_parts.py", "second=3", "unknown key 'second'; did you mean: seconds, seed?"),
+    ],
+)
+def test_a_mistake_costs_one_line(name, argument, message, capsys):
+    assert exit_code(name, argument) == 2
+    assert capsys.readouterr().err == f"error: {message}\n"
+
+
+def test_reduced_data_are_counted():
+    """The gradient of one layer, in each of two updates; a mean of one number."""
+
+    class OneLayer:
+        def state_shapes(self):
+            return jax.ShapeDtypeStruct((3, 5), jnp.float32)
+
+        def collect(self, state):
+            return state, jnp.zeros((7, 3))
+
+        def learn(self, state, batch):
+            def update(weights, _):
+                grads = jax.grad(lambda weights: jnp.square(batch @ weights).mean())(weights)
+                return weights - collectives.mean(grads, collectives.DEVICES), None
+
+            state, _ = jax.lax.scan(update, state, length=2)
+            return state, collectives.total(state.sum(), collectives.DEVICES)
+
+    assert reduced_bytes(OneLayer(), 4) == 4 * (2 * 3 * 5 + 1)
+
+
+def test_products_are_counted():
+    """By hand: 2·m·k·n each; ten times in a loop; the larger of two branches; twice in the gradient of a vector."""
+    a, b, v = jnp.zeros((3, 5)), jnp.zeros((5, 7)), jnp.zeros(5)
+    assert matmul_flops(lambda a, b: a @ b, a, b) == 2 * 3 * 5 * 7
+    assert matmul_flops(jax.vmap(lambda v, b: v @ b, (0, None)), a, b) == 2 * 3 * 5 * 7
+    loop = jax.jit(lambda a: jax.lax.scan(lambda c, _: (c + a @ b @ b.T, None), a, length=10)[0])
+    assert matmul_flops(loop, a) == 10 * 2 * (2 * 3 * 5 * 7)
+    branch = lambda c: jax.lax.cond(c, lambda: (a @ b)[0, 0], lambda: 0.0)  # noqa: E731
+    assert matmul_flops(branch, True) == 2 * 3 * 5 * 7
+    assert matmul_flops(jax.grad(lambda b: jnp.tanh(v @ b).sum()), b) == 2 * (2 * 5 * 7)
