@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import sys
 
 from mjx_walk.storage.files import NO_WORKING_FOLDER
@@ -27,20 +28,12 @@ def check_surroundings(arguments: list[str]) -> None:
     except FileNotFoundError:
         raise UserError(NO_WORKING_FOLDER) from None
     encoding = sys.getfilesystemencoding()
+    # Python puts a lone surrogate in the place of a byte that it cannot decode.
     for name, text in (("the working folder", here), *(("the argument", argument) for argument in arguments)):
-        if not _is_text(text) and (encoding != "utf-8" or text == here):
+        if re.search("[\ud800-\udfff]", text) and (encoding != "utf-8" or text == here):
             shown = os.fsencode(text).decode("utf-8", errors="backslashreplace")
             advice = "set PYTHONUTF8=1" if encoding != "utf-8" else "change to another folder"
             raise UserError(f"{name} '{shown}' is no text in the encoding of this locale, {encoding}; {advice}")
-
-
-def _is_text(text: str) -> bool:
-    """Whether a text from the system could be decoded, so that it can be encoded again."""
-    try:
-        text.encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def correctable(error: OSError) -> str | None:

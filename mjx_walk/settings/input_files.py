@@ -11,6 +11,7 @@ from mjx_walk.envs import TASKS, Task, TaskOptions
 from mjx_walk.envs.model_files import changed_names, model_path, source_hashes
 from mjx_walk.envs.registry import task_hashes
 from mjx_walk.envs.user_files import source_path
+from mjx_walk.settings.trust import are_hashes
 from mjx_walk.storage.checksums import read_json, take_checksum, with_checksum
 from mjx_walk.storage.files import read_bytes, write_text
 from mjx_walk.storage.run_folder import RunFolder
@@ -153,14 +154,9 @@ def _read(folder: RunFolder) -> Inputs:
         return {}
     except (OSError, ValueError):
         content = None
-    if isinstance(content, dict) and take_checksum(content) and _are_inputs(content.get("sha256")):
-        return content["sha256"]
+    if isinstance(content, dict) and take_checksum(content):
+        inputs = content.get("sha256")
+        if are_hashes(inputs) and all(name.isprintable() for hashes in inputs.values() for name in hashes):
+            return inputs
     warnings.warn(f"{folder.inputs} is damaged: whether the files of the run have changed is not known", stacklevel=4)
     return {}
-
-
-def _are_inputs(content: object) -> bool:
-    if not isinstance(content, dict) or not all(isinstance(hashes, dict) for hashes in content.values()):
-        return False
-    hashes = {name: found for hashes in content.values() for name, found in hashes.items()}
-    return all(name.isprintable() and isinstance(found, str) for name, found in hashes.items())

@@ -3,7 +3,8 @@
 import contextlib
 import copy
 import threading
-from collections.abc import Iterator, MutableMapping
+from collections import UserDict
+from collections.abc import Iterator
 from typing import Any, TypeVar
 
 from hydra.core.config_store import ConfigStore
@@ -65,33 +66,18 @@ _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
 
 
-class _OwnInOneThread(MutableMapping[_Key, _Value]):
+class _OwnInOneThread(UserDict[_Key, _Value]):
     """A dictionary that is another one in the thread that makes it."""
 
     def __init__(self, everyones: dict[_Key, _Value], own: dict[_Key, _Value]):
         self._everyones, self._own, self._owner = everyones, own, threading.get_ident()
 
     @property
-    def _present(self) -> dict[_Key, _Value]:
+    def data(self) -> dict[_Key, _Value]:  # type: ignore[override]
         return self._own if threading.get_ident() == self._owner else self._everyones
 
-    def __getitem__(self, key: _Key) -> _Value:
-        return self._present[key]
-
-    def __setitem__(self, key: _Key, value: _Value) -> None:
-        self._present[key] = value
-
-    def __delitem__(self, key: _Key) -> None:
-        del self._present[key]
-
-    def __iter__(self) -> Iterator[_Key]:
-        return iter(self._present)
-
-    def __len__(self) -> int:
-        return len(self._present)
-
     def __deepcopy__(self, memo: dict[int, object]) -> dict[_Key, _Value]:
-        return copy.deepcopy(self._present, memo)
+        return copy.deepcopy(self.data, memo)
 
 
 def _register_schemas(store: ConfigStore) -> None:

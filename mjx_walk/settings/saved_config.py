@@ -1,8 +1,10 @@
 """The configuration of a run on disk: its `config.yaml`, the copies in its checkpoints, and which of them counts."""
 
+import contextlib
 import dataclasses
 import operator
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TypeVar
 
@@ -112,27 +114,20 @@ def _warn_of_edits(trained: Config, present: Config, file: Path, copy: Path) -> 
 
 def _read(path: Path) -> DictConfig:
     """The nodes of a saved configuration, under the present names of the settings."""
-    try:
-        return under_present_names(read_yaml(path))
-    except UserError:
-        raise
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
-    except _UNREADABLE as error:
-        raise UserError(_unreadable(path, error)) from error
+    with _errors_that_name(path):
+        try:
+            return under_present_names(read_yaml(path))
+        except OSError as error:
+            raise UserError(f"cannot read {path}: {error.strerror}") from error
 
 
 def _parse(saved: DictConfig, path: Path) -> Config:
-    try:
+    with _errors_that_name(path):
         find_saved_task(saved.env.name, saved.env.get("task"), path)
         if saved.algo.name not in ALGORITHMS:
             raise UserError(f"the algorithm '{saved.algo.name}' of {path} is not registered; {_HOW_TO_REGISTER}")
         schema = OmegaConf.structured(Config(env=TASKS[saved.env.name][1](), algo=ALGORITHMS[saved.algo.name][1]()))
         return to_config(OmegaConf.merge(schema, saved))
-    except UserError:
-        raise
-    except _UNREADABLE as error:
-        raise UserError(_unreadable(path, error)) from error
 
 
 _HOW_TO_REGISTER = "call mjx_walk.register_algorithm before load_run, or in the FILE.py of env.task=FILE.py:CLASS"
@@ -142,17 +137,21 @@ _UNREADABLE = (
 )
 
 
-def _unreadable(path: Path, error: BaseException) -> str:
-    """The error for a file that is not a saved configuration, with the line or the setting that is wrong."""
-    reason = first_line(error)
-    if isinstance(error, yaml.MarkedYAMLError) and error.problem and error.problem_mark:
-        reason = f"line {error.problem_mark.line + 1}: {error.problem}"
-    elif isinstance(error, UnicodeDecodeError):
-        reason = "it is not a text in UTF-8"
-    elif getattr(error, "full_key", None):
-        full_key = error.full_key  # type: ignore[attr-defined]
-        reason = reason if "key" in reason.lower() else f"{full_key}: {reason}"
-    return f"{path} is not a configuration of this version: {reason}; correct it, or restore the file from a backup"
+@contextlib.contextmanager
+def _errors_that_name(path: Path) -> Iterator[None]:
+    """Context manager whose errors name the file that is not a saved configuration, and what is wrong in it."""
+    try:
+        yield
+    except UserError:
+        raise
+    except _UNREADABLE as error:
+        reason = first_line(error)
+        if isinstance(error, UnicodeDecodeError):
+            reason = "it is not a text in UTF-8"
+        elif getattr(error, "full_key", None) and "key" not in reason.lower():
+            reason = f"{error.full_key}: {reason}"  # type: ignore[union-attr]
+        advice = "correct it, or restore the file from a backup"
+        raise UserError(f"{path} is not a configuration of this version: {reason}; {advice}") from error
 
 
 def differences(saved: Config, config: Config, besides: tuple[str, ...] = MAY_DIFFER) -> list[str]:

@@ -9,12 +9,13 @@ import os
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeGuard
 
 from mjx_walk.envs.user_files import changed_file, only_known, source_path
 from mjx_walk.storage.files import user_folder, write_text
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["Trusted", "remember", "require_trusted", "trust_file"]
+__all__ = ["Trusted", "are_hashes", "remember", "require_trusted", "trust_file"]
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -94,13 +95,13 @@ def _read() -> Trusted | None:
         content, reason = None, str(error)
     else:
         reason = "it is not a list of reward functions"
-    if _is_trusted(content):
+    if are_hashes(content):
         return content
     _LOGGER.warning("%s is ignored (%s); remove it, or name the file each time", path, reason)
     return None
 
 
-def _is_trusted(content: object) -> bool:
-    if not isinstance(content, dict) or not all(isinstance(hashes, dict) for hashes in content.values()):
-        return False
-    return all(isinstance(found, str) for hashes in content.values() for found in hashes.values())
+def are_hashes(content: object) -> TypeGuard[Trusted]:
+    """Whether a JSON value is a dictionary of dictionaries of texts, as the list and the record of a run folder are."""
+    groups = list(content.values()) if isinstance(content, dict) else [content]
+    return all(isinstance(group, dict) and all(isinstance(found, str) for found in group.values()) for group in groups)

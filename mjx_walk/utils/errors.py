@@ -3,6 +3,8 @@
 import errno
 from pathlib import Path
 
+import yaml
+
 from mjx_walk.utils.text import printable
 
 __all__ = ["UnreadableError", "UserError", "failed_read", "first_line"]
@@ -40,5 +42,7 @@ def failed_read(folder: Path, error: OSError) -> ValueError:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of an error's text that is not empty."""
+    """The first line of an error's text that is not empty. For an error of YAML, the line that is wrong, and how."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem and error.problem_mark:
+        return f"line {error.problem_mark.line + 1}: {error.problem}"
     return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)

@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import inspect
 import math
+import operator
 import textwrap
 import typing
 from collections.abc import Iterable, Mapping
@@ -32,6 +33,8 @@ Schema = TypeVar("Schema")
 MAX_SEED = 2**32 - 1
 """Largest seed. JAX's random keys hold 32 bits of it, so larger seeds would repeat smaller ones."""
 
+_BOUNDS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le, "below": operator.lt}
+"""How a value compares with each of its bounds."""
 _MAX_ITEMS = 100
 """Values that a list may have. Each layer of a network takes its time to compile."""
 _MAX_INT = 10**12
@@ -117,17 +120,11 @@ def _problem(value: Any, limits: Mapping[str, Any]) -> str | None:
         return None
     if isinstance(value, float) and math.isnan(value):
         return "must be a number"
-    # A value that compares with nothing fails these tests.
-    if "above" in limits and not value > limits["above"]:
-        return f"must be above {limits['above']}"
-    if "at_least" in limits and not value >= limits["at_least"]:
-        return f"must be at least {limits['at_least']}"
-    if "at_most" in limits and not value <= limits["at_most"]:
-        return f"must be at most {limits['at_most']}"
+    for name, holds in _BOUNDS.items():
+        if name in limits and not holds(value, limits[name]):  # also a value that compares with nothing
+            return f"must be {name.replace('_', ' ')} {limits[name]}"
     if isinstance(value, int) and abs(value) > _MAX_INT:
         return f"must be at most {_MAX_INT}"
-    if "below" in limits and not value < limits["below"]:
-        return f"must be below {limits['below']}"
     if "choices" in limits and value not in limits["choices"]:
         return f"choose one of: {', '.join(limits['choices'])}"
     if ("above" in limits or "at_least" in limits) and isinstance(value, float) and math.isinf(value):
@@ -258,8 +255,7 @@ def meanings(schema: type) -> dict[str, str]:
 
 
 def _range(limits: Mapping[str, Any]) -> str:
-    words = {"above": "above", "at_least": "at least", "at_most": "at most", "below": "below"}
-    bounds = " and ".join(f"{word} {limits[name]}" for name, word in words.items() if name in limits)
+    bounds = " and ".join(f"{name.replace('_', ' ')} {limits[name]}" for name in _BOUNDS if name in limits)
     return bounds or "|".join(limits.get("choices", ()))
 
 
