@@ -8,7 +8,6 @@ if __name__ != "mjx_walk.envs":  # a second import under another name would dupl
     raise ImportError("import mjx_walk.envs, not envs")
 
 import dataclasses
-import difflib
 from typing import Any
 
 from mjx_walk.envs.registry import BUILT_IN_TASKS, TASKS, register_task
@@ -19,7 +18,7 @@ from mjx_walk.envs.view import View
 from mjx_walk.machine.compat import prepare_jax
 from mjx_walk.storage.files import working_folder
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.near_misses import unknown
+from mjx_walk.utils.near_misses import near_misses, unknown
 from mjx_walk.utils.setting_fields import validate
 
 __all__ = [
@@ -67,7 +66,7 @@ def make_options(name: str, **kwargs: Any) -> TaskOptions:
     known = [field.name for field in dataclasses.fields(options_class) if field.name not in ("name", "task")]
     for option in kwargs:
         if option not in known:
-            near = difflib.get_close_matches(option, known, n=1)
+            near = near_misses(option, known, 1, 0.6)
             hint = f"did you mean '{near[0]}'?" if near else f"valid: {', '.join(known)}"
             raise UserError(f"{name} has no option '{option}'; {hint}")
     options = options_class(**kwargs)

@@ -1,12 +1,12 @@
 """`mjx-walk COMMAND`, or `python -m mjx_walk COMMAND`: run a command, or list all of them."""
 
 import ast
-import difflib
 import importlib
 import sys
 from pathlib import Path
 
 from mjx_walk.cli.console import console
+from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.versions import __version__
 
 __all__ = ["COMMANDS", "main", "usage"]
@@ -15,23 +15,15 @@ COMMANDS = ("train", "eval", "play", "plots", "export", "zoo", "compare", "bench
 _PACKAGES = ("zoo",)
 """Commands that are packages."""
 _OTHER_NAMES = {
-    "benchmark": "bench",
-    "draw": "plots",
-    "enjoy": "play",
-    "evaluate": "eval",
-    "learn": "train",
-    "list": "zoo",
-    "record": "play",
-    "render": "play",
-    "score": "eval",
-    "test": "eval",
-    "v": "--version",
-    "version": "--version",
-    "video": "play",
-    "view": "play",
-    "watch": "play",
+    "train": ("learn",),
+    "eval": ("evaluate", "score", "test"),
+    "play": ("enjoy", "record", "render", "video", "view", "watch"),
+    "plots": ("draw",),
+    "zoo": ("list",),
+    "bench": ("benchmark",),
+    "--version": ("v", "version"),
 }
-"""Our commands for the names that other tools have for them."""
+"""The names that other tools have for our commands."""
 
 
 def main() -> int:
@@ -69,8 +61,9 @@ def _meant(argument: str) -> str:
         return f"play run={argument}"
     if equals and not argument.startswith("-"):
         return f"play {argument}" if key == "run" else f"train {argument}"
-    near = difflib.get_close_matches(key.lower(), (*COMMANDS, *_OTHER_NAMES), 1, cutoff=0.7)
-    return _OTHER_NAMES.get(near[0], near[0]) if near else ""
+    commands = {other: command for command, others in _OTHER_NAMES.items() for other in others}
+    near = near_misses(key, (*COMMANDS, *commands), 1)
+    return commands.get(near[0], near[0]) if near else ""
 
 
 def usage() -> str:

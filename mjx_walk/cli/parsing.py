@@ -4,7 +4,6 @@ Invalid input prints a one-line error and exits with code 2.
 """
 
 import dataclasses
-import difflib
 import functools
 import itertools
 import re
@@ -114,7 +113,7 @@ def parse_own(
         key = argument.partition("=")[0]
         is_own = key in (*own_keys, *_HELP)
         (own if is_own else rest).append(argument)
-        near = difflib.get_close_matches(key, own_keys + other_keys)
+        near = near_misses(key, own_keys + other_keys, cutoff=0.6)
         is_known = is_own or key.lstrip("+~") in other_keys or "." in key or "/" in key
         if {*own_keys} & {*near} and not is_known:
             raise UserError(f"unknown key '{key}'; did you mean: {', '.join(near)}?")

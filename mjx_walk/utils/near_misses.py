@@ -6,23 +6,21 @@ from collections.abc import Collection
 
 __all__ = ["near_misses", "unknown"]
 
-_CUTOFF = 0.7
-"""Least similarity, from 0 to 1."""
 
-
-def near_misses(given: str, known: Collection[str], most: int = 3) -> list[str]:
+def near_misses(given: str, known: Collection[str], most: int = 3, cutoff: float = 0.7) -> list[str]:
     """The known names most similar to a given one, if any, regardless of case, separators and a version `-v5`.
 
     Args:
         given: the name.
         known: valid names.
         most: of them that are returned.
+        cutoff: least similarity, from 0 to 1.
     """
     plain = {_plain(name): name for name in known}
     wanted = _plain(given)
     if wanted in plain:
         return [plain[wanted]]
-    return [plain[name] for name in difflib.get_close_matches(wanted, plain, most, _CUTOFF)]
+    return [plain[name] for name in difflib.get_close_matches(wanted, plain, most, cutoff)]
 
 
 def unknown(what: str, given: str, known: Collection[str]) -> str:
