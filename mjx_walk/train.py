@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 import os
 import sys
 import textwrap
@@ -13,7 +14,6 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, open_dict
 
@@ -26,12 +26,11 @@ from mjx_walk.settings.config import (
     CONFIG_DIR,
     Config,
     compose_config,
-    load_config,
     to_config,
     with_absolute_paths,
 )
 from mjx_walk.settings.input_files import check_inputs
-from mjx_walk.settings.overrides import complete_overrides, key_of_value
+from mjx_walk.settings.overrides import key_of_value, read_overrides
 from mjx_walk.settings.own_hydra import own_hydra
 from mjx_walk.settings.recipe_files import with_stored_recipes
 from mjx_walk.settings.renamed import present_overrides
@@ -41,6 +40,7 @@ from mjx_walk.storage.run_folder import RunFolder, new_folder
 from mjx_walk.training import launcher
 from mjx_walk.training.distributed import Processes, join_processes
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.near_misses import unknown
 from mjx_walk.utils.setting_fields import describe, meanings, refuse_ineffective, table
 
 __all__ = ["USAGE", "Own", "main"]
@@ -65,10 +65,12 @@ usage: python -m mjx_walk.train [env=humanoid] [algo=ppo] [KEY=VALUE ...]
   algo=NAME --help                        also list the settings of the algorithm, with ranges and meanings
 """
 
-_HYDRAS_FLAGS_WITH_VALUE = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--experimental-rerun")
+_FLAGS_WITH_VALUE = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--experimental-rerun")
+_FLAGS = (*_FLAGS_WITH_VALUE, "--multirun", "-m", "--resolve", "--hydra-help", "--shell-completion", "-sc")
+"""Flags of Hydra."""
+_MULTIRUN, _CFG = {"--multirun", "-m"}, {"--cfg", "-c"}
 _PRINTED = ("job", "hydra", "all")
 """Values of `--cfg`."""
-_HYDRAS_OTHER_FLAGS = ("--multirun", "-m", "--resolve", "--hydra-help", "--shell-completion", "-sc")
 
 
 @dataclasses.dataclass
@@ -90,7 +92,6 @@ def main(arguments: list[str]) -> int:
         _through_hydra(arguments)
         return 0
     own, overrides = parsing.parse_own(Own, Config, arguments, USAGE, key_of_value)
-    overrides = present_overrides(overrides)
     if own.seeds is not None and own.devices is not None:
         raise UserError("give seeds=… or devices=…, not both")
     processes = join_processes() if own.devices is not None else Processes()
@@ -99,7 +100,8 @@ def main(arguments: list[str]) -> int:
     if own.devices is not None:
         count = launcher.count(own.devices)
         if count > 1:
-            resolve(overrides)  # reports invalid settings once instead of once per process
+            overrides = present_overrides(overrides)  # warns once instead of once per process
+            resolve(overrides)  # so do errors
             return launcher.run([f"devices={own.devices}", *overrides], count)
     configs = resolve_seeds(overrides, parsing.read_seeds(own.seeds)) if own.seeds is not None else [resolve(overrides)]
     _, signal_name = train(configs)
@@ -112,7 +114,7 @@ def _help(arguments: list[str]) -> str:
     if not given:
         return USAGE.strip()
     if given[-1] not in ALGORITHMS:
-        raise UserError(f"unknown algo '{given[-1]}'; choose one of: {', '.join(ALGORITHMS)}")
+        raise UserError(unknown("algo", given[-1], ALGORITHMS))
     schema = ALGORITHMS[given[-1]][1]
     meaning, indent = meanings(schema), " " * 6
     lines = []
@@ -141,60 +143,35 @@ def _train_in_process(overrides: list[str], processes: Processes) -> int:
     return exit_code(signal_name) if signal_name else 0
 
 
-def _without_hydras(arguments: list[str]) -> list[str]:
-    """The arguments that are not Hydra's flags or their values."""
-    flags = (*_HYDRAS_FLAGS_WITH_VALUE, *_HYDRAS_OTHER_FLAGS)
-    before = ["", *arguments]
-    return [
-        argument
-        for argument, previous in zip(arguments, before, strict=False)
-        if argument.partition("=")[0] not in flags and previous not in _HYDRAS_FLAGS_WITH_VALUE
-    ]
-
-
-def _check_cfg(arguments: list[str]) -> None:
-    """Check the value of `--cfg`, about which Hydra prints several lines.
-
-    Raises:
-        UserError: it is missing or unknown.
-    """
-    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        flag, equals, value = argument.partition("=")
-        if flag in ("--cfg", "-c") and (value if equals else following) not in _PRINTED:
-            raise UserError(f"{flag} prints a configuration; write --cfg job, --cfg hydra or --cfg all")
-
-
 def _through_hydra(arguments: list[str]) -> None:
-    """Pass flags to Hydra: sweeps, launchers, `--cfg`.
+    """Print a configuration, or pass flags to Hydra: sweeps, launchers, `--info`.
 
     Raises:
-        UserError: Hydra refuses the arguments.
+        UserError: invalid arguments, or Hydra refuses them.
     """
-    hints = typing.get_type_hints(Config) | typing.get_type_hints(Own)
-    parsing.refuse_flags(_without_hydras(arguments), key_of_value, hints)
-    _check_cfg(arguments)
-    given = [a for a in arguments if not a.startswith("-") and ("=" in a or a.startswith(("+", "~")))]
-    flags = [argument for argument in arguments if argument not in given]
-    if flags in (["--cfg", "job"], ["-c", "job"], ["--cfg=job"], ["-c=job"]):
-        given = present_overrides(given)
-        load_config(given)  # reports errors in one line
+    flags, given = _split(arguments)
+    parsing.refuse_flags(given, key_of_value, typing.get_type_hints(Config) | typing.get_type_hints(Own))
+    for flag in _CFG & flags.keys():
+        if flags[flag] not in _PRINTED:
+            raise UserError(f"{flag} prints a configuration; write --cfg job, --cfg hydra or --cfg all")
+    if flags in ({"--cfg": "job"}, {"-c": "job"}):
         print(as_yaml_with_sources(given), end="")
         return
-    overrides = complete_overrides(given, is_sweep=bool({"-m", "--multirun"} & {*flags}))
-    parsed = OverridesParser.create().parse_overrides(overrides)
-    for override in parsed:
-        if override.is_sweep_override() and not any(True for _ in override.sweep_iterator()):
+    is_sweep = bool(_MULTIRUN & flags.keys())
+    overrides = read_overrides(given, is_sweep)
+    swept = [override for override in overrides if override.is_sweep_override()]
+    for override in swept:
+        if not any(True for _ in override.sweep_iterator()):
             raise UserError(f"{override.input_line} gives no value; give one, or several with commas")
-    plain = [o for o in parsed if not o.is_sweep_override() and not o.key_or_group.startswith("hydra")]
-    # Reports errors in one line, where Hydra takes several. A swept setting may enable others.
-    check = compose_config if any(o.is_sweep_override() for o in parsed) else load_config
-    check([str(o.input_line) for o in plain])
-    if {"-m", "--multirun"} & {*flags} and {"-c", "--cfg", "-i", "--info"} & {*flags}:
+    # Reports errors in one line, where Hydra takes several.
+    plain = [o for o in overrides if not o.is_sweep_override() and not o.key_or_group.startswith("hydra")]
+    compose_config(plain, is_partial=bool(swept))
+    if is_sweep and {*_CFG, "--info", "-i"} & flags.keys():
         raise UserError("-m trains a sweep and --cfg prints a configuration: give one of them")
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    with _sweep_folder(flags, [override.key_or_group for override in parsed]) as folder, own_hydra() as store:
-        # Hydra wants all overrides together.
-        sys.argv = [sys.argv[0], *flags, *with_stored_recipes(overrides, store), *folder]
+    with _sweep_folder(is_sweep, [o.key_or_group for o in overrides]) as folder, own_hydra() as store:
+        words = [f"{flag}={value}" if value else flag for flag, value in flags.items()]
+        sys.argv = [sys.argv[0], *words, *with_stored_recipes(overrides, store), *folder]  # all overrides together
         try:
             hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")(_sweep_job)()
         except HydraException as error:
@@ -202,13 +179,28 @@ def _through_hydra(arguments: list[str]) -> None:
             raise UserError(" ".join(what.split())) from error
 
 
+def _split(arguments: list[str]) -> tuple[dict[str, str], list[str]]:
+    """Hydra's flags with their values, which are empty for a flag without one, and the other arguments."""
+    flags: dict[str, str] = {}
+    others = []
+    for previous, argument in itertools.pairwise(["", *arguments]):
+        flag, _, value = argument.partition("=")
+        if flag in _FLAGS:
+            flags[flag] = value
+        elif previous in _FLAGS_WITH_VALUE and "=" not in argument and not argument.startswith("-"):
+            flags[previous] = argument
+        else:
+            others.append(argument)
+    return flags, others
+
+
 @contextlib.contextmanager
-def _sweep_folder(flags: list[str], keys: list[str]) -> Iterator[list[str]]:
+def _sweep_folder(is_sweep: bool, keys: list[str]) -> Iterator[list[str]]:
     """Context manager that creates the folder of a sweep, and yields Hydra's override for it.
 
     Hydra alone would give two sweeps of the same second one folder. If the sweep fails early, the folder is removed.
     """
-    if not {"-m", "--multirun"} & {*flags} or "hydra.sweep.dir" in keys:
+    if not is_sweep or "hydra.sweep.dir" in keys:
         yield []
         return
     folder = new_folder(Path("runs", "sweeps"))

@@ -1,20 +1,22 @@
 """The configuration of a run: how a command line becomes one, and back."""
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mjx_walk import envs
 from mjx_walk.settings.error_messages import explain
-from mjx_walk.settings.overrides import complete_overrides
+from mjx_walk.settings.overrides import read_overrides
 from mjx_walk.settings.own_hydra import own_hydra
 from mjx_walk.settings.recipe_files import with_paths, with_stored_recipes
 from mjx_walk.settings.recipes import CONFIG_DIR, recipe_names
-from mjx_walk.settings.renamed import present_overrides
 from mjx_walk.settings.schema import CheckpointConfig, Config, leaves
 from mjx_walk.storage.files import user_path, working_folder
 from mjx_walk.utils.errors import UserError
@@ -25,6 +27,7 @@ __all__ = [
     "CheckpointConfig",
     "Config",
     "compose_config",
+    "composing",
     "flatten",
     "load_config",
     "recipe_names",
@@ -44,27 +47,40 @@ def load_config(overrides: list[str]) -> Config:
         UserError: invalid overrides, in one line that names the valid choices; or a given setting that has no effect,
             unless a run is resumed.
     """
-    overrides = present_overrides(overrides)
-    config = compose_config(overrides)
-    if not config.resume:
-        refuse_ineffective(config, (override.partition("=")[0] for override in overrides))
+    return compose_config(read_overrides(overrides))
+
+
+def compose_config(overrides: list[Override], is_partial: bool = False) -> Config:
+    """Compose and check a configuration.
+
+    Args:
+        overrides: as `read_overrides` returns them.
+        is_partial: whether further settings follow, so that a given one may still get an effect.
+
+    Raises:
+        UserError: as for `load_config`.
+    """
+    with composing(overrides) as texts:
+        config = to_config(compose("train", texts))
+    config = with_absolute_paths(config, working_folder())
+    if not (config.resume or is_partial):
+        refuse_ineffective(config, (override.key_or_group for override in overrides))
     return config
 
 
-def compose_config(overrides: list[str]) -> Config:
-    """Compose a configuration and check its ranges, but not whether the given settings have an effect.
+@contextlib.contextmanager
+def composing(overrides: list[Override]) -> Iterator[list[str]]:
+    """Context manager in which Hydra composes configurations of this package, and its errors name what to type instead.
 
-    Args:
-        overrides: as for `load_config`.
+    Yields:
+        The overrides as Hydra takes them.
 
     Raises:
         UserError: invalid overrides.
     """
-    overrides = complete_overrides(overrides)
     try:
         with own_hydra() as store, initialize_config_dir(CONFIG_DIR, version_base="1.3"):
-            config = to_config(compose("train", with_stored_recipes(overrides, store)))
-        return with_absolute_paths(config, working_folder())
+            yield with_stored_recipes(overrides, store)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(with_paths(explain(error, overrides))) from error
 

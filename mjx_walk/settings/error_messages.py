@@ -1,10 +1,10 @@
 """The errors of Hydra and OmegaConf about a command line, in one line that says what to type instead."""
 
-import difflib
 import re
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
+
+from hydra.core.override_parser.types import Override
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
@@ -18,26 +18,19 @@ from mjx_walk.utils.value_types import plain_type, type_mistake
 __all__ = ["explain", "unknown_key"]
 
 _ELSEWHERE = {
-    "algorithm": "algo",
-    "clip_range": "algo.clip_epsilon",
-    "env_id": "env",
-    "env_name": "env",
-    "environment": "env",
-    "folder": "run_dir",
-    "gamma": "algo.discount",
-    "hidden_sizes": "algo.policy_hidden_layer_sizes",
-    "lr": "algo.learning_rate",
-    "n_envs": "num_envs",
-    "n_epochs": "algo.num_epochs",
-    "net_arch": "algo.policy_hidden_layer_sizes",
-    "out": "run_dir",
-    "run": "run_dir",
-    "steps": "total_steps",
-    "timesteps": "total_steps",
-    "total_timesteps": "total_steps",
-    "wandb": "wandb_project",
+    "algo": ("algorithm",),
+    "algo.clip_epsilon": ("clip_range",),
+    "algo.discount": ("gamma",),
+    "algo.learning_rate": ("lr",),
+    "algo.num_epochs": ("n_epochs",),
+    "algo.policy_hidden_layer_sizes": ("hidden_sizes", "net_arch"),
+    "env": ("env_id", "env_name", "environment"),
+    "num_envs": ("n_envs",),
+    "run_dir": ("folder", "out", "run"),
+    "total_steps": ("steps", "timesteps", "total_timesteps"),
+    "wandb_project": ("wandb",),
 }
-"""Our keys for the names that other libraries and other commands have for them."""
+"""The names that other libraries and other commands have for our keys."""
 _GROUPS = ("hardware", "recipe")
 """Hydra's groups that are not settings."""
 _MOST_LISTED = 8
@@ -45,16 +38,16 @@ _MOST_LISTED = 8
 _UNKNOWN_KEY = re.compile("not in struct|not in '|Could not override")
 
 
-def explain(error: BaseException, overrides: list[str]) -> str:
+def explain(error: BaseException, overrides: list[Override]) -> str:
     """The line for an error. The useful detail is often in its cause.
 
     Args:
         error: what composing the configuration has raised.
-        overrides: the completed command line.
+        overrides: the command line, as `read_overrides` returns it.
     """
-    env, algo = chosen(overrides)
+    given = {override.key_or_group: str(override.input_line).partition("=")[2] for override in overrides}
+    env, algo = chosen(given)
     types = setting_types(env, algo)
-    given = dict(override.split("=", 1) for override in overrides if "=" in override)
     texts = [str(error), str(error.__cause__ or "")]
     if "raised while composing config" in texts[0]:
         return _unfit_recipe(texts[0], given, env, algo)
@@ -91,7 +84,8 @@ def unknown_key(key: str, env: str, algo: str) -> str:
     owners = _owners(section, name)
     if owners and owners[0] not in settings:
         full, having = owners
-        return f"unknown key '{key}'; {full} is a setting of {', '.join(having)}, not of {_chosen_in(full, env, algo)}"
+        owner = algo if full.startswith("algo.") else env
+        return f"unknown key '{key}'; {full} is a setting of {', '.join(having)}, not of {owner}"
     near = _similar(key, settings)
     if near:
         return f"unknown key '{key}'; did you mean: {', '.join(near)}?"
@@ -104,14 +98,13 @@ def unknown_key(key: str, env: str, algo: str) -> str:
 def _similar(key: str, known: list[str]) -> list[str]:
     """The known keys that a key may stand for."""
     name = key.rpartition(".")[2]
-    if _ELSEWHERE.get(name) in (*known, "env", "algo"):
-        return [_ELSEWHERE[name]]
-    same = [other for other in known if other.rpartition(".")[2] == name]
+    same = [ours for ours, others in _ELSEWHERE.items() if name in others and ours in (*known, "env", "algo")]
+    same = same or [other for other in known if other.rpartition(".")[2] == name]
     if same:
         return same
-    close = difflib.get_close_matches(key, known, 3, 0.75)
     last = {other.rpartition(".")[2]: other for other in known}
-    return list(dict.fromkeys([*close, *(last[other] for other in difflib.get_close_matches(name, last, 2, 0.75))]))
+    near = [*near_misses(key, known, 3, 0.75), *(last[other] for other in near_misses(name, last, 2, 0.75))]
+    return list(dict.fromkeys(near))
 
 
 def _owners(section: str, name: str) -> tuple[str, list[str]] | None:
@@ -125,10 +118,6 @@ def _owners(section: str, name: str) -> tuple[str, list[str]] | None:
         if having and section in ("", group):
             return f"{group}.{name}", having
     return None
-
-
-def _chosen_in(full_key: str, env: str, algo: str) -> str:
-    return algo if full_key.startswith("algo.") else env
 
 
 def _unfit_recipe(text: str, given: dict[str, str], env: str, algo: str) -> str:
@@ -167,15 +156,11 @@ def _unknown_choice(group: str, value: str, env: str, algo: str) -> str:
     if group == "hardware":
         return f"hardware={value}: choose one of: cpu, gpu"
     own = [name for name in recipe_names() if name.endswith(f"/{env}_{algo}")]
-    nearest = near_misses(value, recipe_names())
-    near = nearest if nearest and nearest[0] not in own else _near_recipes(value, own)
+    near = near_misses(value, recipe_names())
+    if not near or near[0] in own:
+        near = [name for name in own if name.rpartition("/")[2] == value] or near_misses(value, own)
     hint = f"did you mean: {', '.join(near)}?" if near else fitting_recipes(env, algo)
     return f"unknown recipe '{value}'; {hint}"
-
-
-def _near_recipes(value: str, names: Collection[str]) -> list[str]:
-    """The recipes of these names whose last part is the value, or that resemble it."""
-    return [name for name in names if name.rpartition("/")[2] == value] or near_misses(value, names)
 
 
 def _several_values(key: str, text: str, types: dict[str, object]) -> str:

@@ -9,13 +9,13 @@ from typing import Any
 
 import yaml
 from hydra.core.config_store import ConfigStore
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
+from mjx_walk.settings.overrides import named_values
 from mjx_walk.settings.recipes import CONFIG_DIR, HARDWARE, fallback, has_file
 from mjx_walk.settings.schema import leaves
 from mjx_walk.storage.files import read_bytes, user_path, working_folder
@@ -41,7 +41,7 @@ def recipe_file(name: str, folder: Path | None = None) -> Path | None:
     Raises:
         UserError: a path that leads to no file.
     """
-    if _is_shipped(name):
+    if _shipped_file(name):
         return None
     path = Path(os.path.abspath((folder or working_folder()) / user_path(name)))
     for file in (path, path.with_name(f"{path.name}.yaml")):
@@ -53,23 +53,21 @@ def recipe_file(name: str, folder: Path | None = None) -> Path | None:
     return None
 
 
-def _shipped_file(name: str) -> Path:
+def _shipped_file(name: str) -> Path | None:
+    """The file of a recipe of this package, which may be the one that it falls back to. None for other names."""
     name = name.removesuffix(".yaml")
-    return _RECIPES / f"{fallback(name) or name}.yaml"
+    parent = fallback(name)
+    is_shipped = not name.startswith((".", "/", "~")) and (has_file(name) or parent is not None)
+    return _RECIPES / f"{parent or name}.yaml" if is_shipped else None
 
 
-def _is_shipped(name: str) -> bool:
-    name = name.removesuffix(".yaml")
-    return not name.startswith((".", "/", "~")) and (has_file(name) or fallback(name) is not None)
-
-
-def with_stored_recipes(overrides: list[str], store: ConfigStore) -> list[str]:
+def with_stored_recipes(overrides: list[Override], store: ConfigStore) -> list[str]:
     """Overrides in which recipe files have the names under which Hydra finds them in the store.
 
     Recipes of this package without a file are stored, too.
 
     Args:
-        overrides: completed arguments of the command line.
+        overrides: the command line, as `read_overrides` returns it.
         store: Hydra's store; the files are read into it.
 
     Raises:
@@ -81,13 +79,12 @@ def with_stored_recipes(overrides: list[str], store: ConfigStore) -> list[str]:
             defaults = [f"/recipe/{parent}", _SELF] if parent else [_SELF]
             group, _, stem = name.partition("/")
             store.store(group=f"recipe/{group}", name=stem, node={"defaults": defaults}, package="_global_")
-    return [_with_stored_recipe(text, store) if text.startswith("recipe=") else text for text in overrides]
+    return [_with_stored_recipe(override, store) for override in overrides]
 
 
-def _shipped_names(overrides: list[str]) -> list[str]:
+def _shipped_names(overrides: list[Override]) -> list[str]:
     """Names of recipes of this package for which overrides ask, with several values in a sweep."""
-    parsed = OverridesParser.create().parse_overrides(overrides)
-    given = {override.key_or_group: _values(override) for override in parsed}
+    given = {override.key_or_group: named_values(override) for override in overrides}
     if given.get("recipe"):
         return given["recipe"]
     all_values = {"hardware": HARDWARE, "env": TASKS, "algo": ALGORITHMS}
@@ -103,21 +100,12 @@ def with_paths(message: str) -> str:
     return message
 
 
-def _with_stored_recipe(text: str, store: ConfigStore) -> str:
-    override = OverridesParser.create().parse_override(text)
+def _with_stored_recipe(override: Override, store: ConfigStore) -> str:
     names = []
-    for value in _values(override):
+    for value in named_values(override) if override.key_or_group == "recipe" else ():
         file = recipe_file(value)
         names.append(_store(file, store, ()) if file else value)
-    return f"recipe={','.join(names)}" if names else text
-
-
-def _values(override: Override) -> list[str]:
-    """The names that an override gives; none for `null` and for sweeps that are no list."""
-    if override.is_choice_sweep():
-        return [value.strip("'\"") for value in override.sweep_string_iterator()]
-    value = override.value()
-    return [str(value)] if isinstance(value, str) else []
+    return f"recipe={','.join(names)}" if names else str(override.input_line)
 
 
 def _store(path: Path, store: ConfigStore, above: tuple[Path, ...]) -> str:
@@ -152,10 +140,7 @@ def _inherited_file(entry: object, path: Path) -> Path | None:
     """
     if not isinstance(entry, str) or entry == _SELF:
         return None
-    shipped = entry.removeprefix("/recipe/")
-    if _is_shipped(shipped):
-        return _shipped_file(shipped)
-    file = recipe_file(entry, path.parent)
+    file = _shipped_file(entry.removeprefix("/recipe/")) or recipe_file(entry, path.parent)
     if file is None:
         raise UserError(f"{path} inherits from '{entry}', which is neither a file beside it nor a recipe")
     return file
@@ -179,8 +164,7 @@ def read_recipe(path: Path) -> DictConfig:
     except OSError as error:
         raise UserError(f"cannot read the recipe {path}: {error.strerror}") from error
     except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise UserError(f"the recipe {path} is not valid YAML: line {line}: {error.problem}") from error
+        raise UserError(f"the recipe {path} is not valid YAML: {first_line(error)}") from error
     except (ValueError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
         raise UserError(f"the recipe {path} cannot be read: {first_line(error)}") from error
     if not isinstance(node, DictConfig) or not node or any(not isinstance(key, str) for key in node):

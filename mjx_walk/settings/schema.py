@@ -11,7 +11,7 @@ from mjx_walk.envs import TASKS
 from mjx_walk.envs.physics import ENGINES
 from mjx_walk.utils.setting_fields import MAX_SEED, Dataclass, setting
 
-__all__ = ["CheckpointConfig", "Config", "chosen", "leaves", "setting_types"]
+__all__ = ["CheckpointConfig", "Config", "chosen", "leaves", "setting_types", "text_keys"]
 
 
 @dataclasses.dataclass
@@ -75,13 +75,12 @@ def leaves(values: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield f"{prefix}{key}", value
 
 
-def chosen(overrides: list[str]) -> tuple[str, str]:
+def chosen(given: Mapping[str, str]) -> tuple[str, str]:
     """The environment and the algorithm of a command line; the default where it names none that is known.
 
     Args:
-        overrides: arguments of the command line.
+        given: values of the command line by their keys.
     """
-    given = dict(override.split("=", 1) for override in overrides if "=" in override)
     env, algo = given.get("env", "humanoid"), given.get("algo", "ppo")
     return (env if env in TASKS else "humanoid"), (algo if algo in ALGORITHMS else "ppo")
 
@@ -93,14 +92,28 @@ def setting_types(env: str, algo: str) -> dict[str, object]:
         env: name of the task.
         algo: name of the algorithm.
     """
-    return dict(_walk(Config, "", {"env": TASKS[env][1], "algo": ALGORITHMS[algo][1]}))
+    return {key: hint for key, hint, _ in _walk(Config, "", {"env": TASKS[env][1], "algo": ALGORITHMS[algo][1]})}
 
 
-def _walk(schema: Dataclass | type[Dataclass], prefix: str, groups: Mapping[str, type]) -> Iterator[tuple[str, object]]:
+def text_keys(env: str, algo: str) -> set[str]:
+    """Keys of the settings that hold any text: paths and names.
+
+    Args:
+        env: name of the task.
+        algo: name of the algorithm.
+    """
+    settings = _walk(Config, "", {"env": TASKS[env][1], "algo": ALGORITHMS[algo][1]})
+    return {key for key, hint, limits in settings if hint in (str, str | None) and "choices" not in limits}
+
+
+def _walk(
+    schema: Dataclass | type[Dataclass], prefix: str, groups: Mapping[str, type]
+) -> Iterator[tuple[str, object, Mapping[str, Any]]]:
+    """The full key, the annotation and the limits of every setting and of every group of settings."""
     hints = typing.get_type_hints(schema)
     for field in dataclasses.fields(schema):
         key = prefix + field.name
         hint = groups.get(key, hints[field.name])
-        yield key, hint
+        yield key, hint, field.metadata
         if dataclasses.is_dataclass(hint):
             yield from _walk(hint, f"{key}.", groups)

@@ -4,16 +4,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import yaml
-from hydra import compose, initialize_config_dir
+from hydra import compose
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.default_element import ResultDefault
 from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from mjx_walk.settings.overrides import complete_overrides
-from mjx_walk.settings.own_hydra import own_hydra
-from mjx_walk.settings.recipe_files import with_paths, with_stored_recipes
+from mjx_walk.settings.config import compose_config, composing
+from mjx_walk.settings.overrides import read_overrides
+from mjx_walk.settings.recipe_files import with_paths
 from mjx_walk.settings.recipes import CONFIG_DIR
 from mjx_walk.settings.schema import leaves
 
@@ -24,16 +24,19 @@ _COMMAND_LINE = "command line"
 
 
 def as_yaml_with_sources(overrides: list[str]) -> str:
-    """The configuration of a valid command line as YAML, with a comment after each value that names its source.
+    """The configuration of a command line as YAML, with a comment after each value that names its source.
 
     Args:
         overrides: arguments of the command line.
+
+    Raises:
+        UserError: as for `load_config`.
     """
-    completed = complete_overrides(overrides)
-    with own_hydra() as store, initialize_config_dir(CONFIG_DIR, version_base="1.3"):
-        stored = with_stored_recipes(completed, store)
-        text = OmegaConf.to_yaml(compose("train", stored))
-        sources = _sources(GlobalHydra.instance().config_loader(), stored)
+    read = read_overrides(overrides)
+    compose_config(read)  # checks it
+    with composing(read) as texts:
+        text = OmegaConf.to_yaml(compose("train", texts))
+        sources = _sources(GlobalHydra.instance().config_loader(), texts)
     if not any(override.startswith("hardware=") for override in overrides):
         sources["hardware"] = "devices of this machine"
     root = yaml.compose(text)
@@ -61,8 +64,9 @@ def _sources(loader: ConfigLoader, overrides: list[str]) -> dict[str, str]:
 def _keys(file: ResultDefault, loader: ConfigLoader) -> Iterator[str]:
     """The full keys of the values that a file, or a dataclass among Hydra's groups, sets."""
     path, prefix = str(file.config_path), f"{file.package}." if file.package else ""
-    source = next(source for source in loader.get_sources() if source.is_config(path))
-    yield from (key for key, _ in leaves(OmegaConf.to_container(source.load_config(path).config), prefix))
+    for source in loader.get_sources():
+        if source.is_config(path):
+            yield from (key for key, _ in leaves(OmegaConf.to_container(source.load_config(path).config), prefix))
 
 
 def _name(path: str) -> str:
@@ -72,9 +76,8 @@ def _name(path: str) -> str:
         recipe = with_paths(name)
         is_shipped = recipe.startswith(CONFIG_DIR)
         return f"recipe {str(Path(recipe).relative_to(_RECIPES).with_suffix('')) if is_shipped else recipe}"
-    return {"env": f"default of {name}", "algo": f"default of {name}", "hardware": f"hardware {name}"}.get(
-        group, "default"
-    )
+    names = {"env": f"default of {name}", "algo": f"default of {name}", "hardware": f"hardware {name}"}
+    return names.get(group, "default")
 
 
 def _ends(node: yaml.MappingNode, prefix: str) -> Iterator[tuple[int, str]]:

@@ -192,10 +192,10 @@ def test_runs_that_start_in_the_same_second_get_folders_of_their_own(tmp_path, m
 
 def test_sweeps_that_start_in_the_same_second_get_folders_of_their_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with train_command._sweep_folder(["-m"], []) as one, train_command._sweep_folder(["-m"], []) as other:
+    with train_command._sweep_folder(True, []) as one, train_command._sweep_folder(True, []) as other:
         assert one != other and len([*Path("runs/sweeps").iterdir()]) == 2
     assert list(tmp_path.iterdir()) == []
-    with train_command._sweep_folder([], []) as none, train_command._sweep_folder(["-m"], ["hydra.sweep.dir"]) as own:
+    with train_command._sweep_folder(False, []) as none, train_command._sweep_folder(True, ["hydra.sweep.dir"]) as own:
         assert none == own == [] == list(tmp_path.iterdir())
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from mjx_walk.experiments.planned_runs import plan
 from mjx_walk.settings.config import load_config
-from mjx_walk.settings.overrides import complete_overrides
+from mjx_walk.settings.overrides import read_overrides
 from mjx_walk.settings.own_hydra import own_hydra
 from mjx_walk.settings.recipe_files import with_stored_recipes
 from mjx_walk.utils.errors import UserError
@@ -85,7 +85,7 @@ def test_recipes_are_swept_and_compared(here):
     _, runs = plan([*BASE[:1], "recipe=a.yaml,'b, c.yaml'"], ["ppo"], [0, 1], None, "cpu")
     assert [run.config.num_envs for run in runs] == [8, 16, 8, 16]
     assert [load_config(list(run.overrides)).num_envs for run in runs] == [8, 16, 8, 16]
-    completed = complete_overrides(["hardware=cpu", "recipe=a.yaml,cpu/ant_ppo"], is_sweep=True)
+    read = read_overrides(["hardware=cpu", "recipe=a.yaml,cpu/ant_ppo"], is_sweep=True)
     with own_hydra() as store:
-        swept = with_stored_recipes(completed, store)[-1]
+        swept = with_stored_recipes(read, store)[-1]
     assert swept.startswith("recipe=own_") and swept.endswith(",cpu/ant_ppo")
