@@ -90,8 +90,8 @@ def batch_once(batch_fn: Callable[_Arguments, _Outputs]) -> Callable[_Arguments,
             args,
             tuple(in_batched),
         )
-        out = on_batch(*jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), args))
-        out = jax.tree.map(lambda x: x.reshape((axis_size, -1, *x.shape[1:])), out)
+        out = on_batch(*jax.tree.map(lambda x: jax.lax.collapse(x, 0, 2), args))
+        out = jax.tree.map(lambda x: x.reshape((axis_size, len(x) // axis_size, *x.shape[1:])), out)
         return out, jax.tree.map(lambda _: True, out)
 
     def on_one(*args):

@@ -66,6 +66,8 @@ def test_nested_vmap_calls_a_batched_function_once():
 
     doubled = jax.vmap(jax.vmap(base.batch_once(batch)))(jnp.ones((3, 4, 5)))
     assert doubled.shape == (3, 4, 5) and sizes[-1] == (12, 5)
+    empty = jax.vmap(jax.vmap(base.batch_once(batch)))(jnp.ones((3, 4, 0)))  # a model without motors
+    assert empty.shape == (3, 4, 0) and sizes[-1] == (12, 0)
 
 
 @pytest.mark.parametrize("name", TASKS)
