@@ -14,7 +14,8 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.cli import parsing
 from mjx_walk.experiments import planned_runs
 from mjx_walk.experiments.planned_runs import PlannedRun
-from mjx_walk.experiments.suite import SUITES, plan_suite, write_report
+from mjx_walk.experiments.report import write_report
+from mjx_walk.experiments.suite import SUITES, plan_suite
 from mjx_walk.machine.devices import count_devices
 from mjx_walk.machine.nvidia import warn_of_unused_gpu
 from mjx_walk.machine.signals import exit_code
@@ -87,13 +88,8 @@ def main(command_line: list[str]) -> int:
     # On an H200, three seeds of PPO train in 405 s together and in 486 s in turn. On two cores, sharing gains nothing.
     default = planned_runs.most_together(unfinished, len(slots)) if hardware == "gpu" else 1
     jobs = planned_runs.jobs(unfinished, arguments.together or default)
-    signal_name = planned_runs.run_jobs(
-        jobs,
-        slots,
-        out / "logs",
-        functools.partial(_on_end, out),
-        _on_progress,
-    )
+    on_end = functools.partial(_on_end, out)
+    signal_name = planned_runs.run_jobs(jobs, slots, out / "logs", on_end, _on_progress)
     if signal_name:
         print(f"Stopped by {signal_name}. Run the same command to resume.")
         return exit_code(signal_name)

@@ -1,129 +1,123 @@
-"""The report on runs of one environment: learning curves, Markdown tables and a CSV file."""
+"""The report on runs of one or several environments: a figure, Markdown tables and a CSV file."""
 
+from collections import defaultdict
 from pathlib import Path
 
-import matplotlib.figure
 import numpy as np
 import scipy.stats
-from matplotlib.axes import Axes
 
-from mjx_walk.experiments.logged_runs import MIN_SEEDS_FOR_IQM, LoggedRun, interval, mean_curve
+from mjx_walk.experiments.curves import draw_suite, draw_task
+from mjx_walk.experiments.logged_runs import MIN_SEEDS_FOR_IQM, LoggedRun, group, interval, read_runs
+from mjx_walk.experiments.suite import REFERENCES, normalize
 from mjx_walk.logs.metrics import write_csv
-from mjx_walk.storage.files import replacing, write_text
+from mjx_walk.storage.files import write_text
 from mjx_walk.storage.scores import BEST, FINAL
+from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.text import format_score, in_markdown
-from mjx_walk.viewing.run_plots import evaluations, learning_axes, series
+from mjx_walk.viewing.figures import standard_style
 
-__all__ = ["DRAWN", "LEGEND", "csv_row", "draw_curves", "run_cells", "table", "write_comparison"]
+__all__ = ["write_report"]
 
-DRAWN = (
-    "Lines: with exploration noise, each seed thin, their mean bold. Dots: evaluations without noise. "
-    "Stars: final policies in Gymnasium."
-)
-LEGEND = (
+_LEGEND = (
     "Scores are mean returns in Gymnasium. The final policy is the newest one. The best policy has the highest "
     "evaluation during training. In files from older versions, it is the better of the two on the scored episodes.\n"
 )
+_NORMALIZED = (
+    "A normalized score is 0 for uniformly random actions and 1 for the highest mean that SLM-Lab 5 has published for "
+    "PPO, SAC and CrossQ on the same environment. Mean and IQM (interquartile mean) are taken over the environments, "
+    "for each seed that is scored in all of them, and averaged over these seeds. Intervals are Student's 95% intervals "
+    "over these seeds, given for three or more.\n"
+)
+_MIN_ENVIRONMENTS_FOR_IQM = 4
+"""With fewer, an interquartile mean leaves nothing out."""
+Tasks = dict[str, dict[str, list[LoggedRun]]]
+"""Runs by environment and label."""
 
 
-def write_comparison(folder: Path, groups: dict[str, list[LoggedRun]]) -> Path:
-    """Write `comparison.png`, `comparison.md` and `comparison.csv`.
-
-    Args:
-        folder: where to write them.
-        groups: runs of one environment, by label.
+@standard_style()
+def write_report(folder: Path) -> Path:
+    """Write `comparison.png`, `comparison.md` and `comparison.csv` about all runs below a folder.
 
     Returns:
         The Markdown file.
 
     Raises:
-        OSError: the folder cannot be written to.
+        UserError: there are no runs, one holds links or pipes, or the folder cannot be written to.
     """
-    _draw(groups, folder / "comparison.png")
-    write_csv([csv_row(name, run) for name, runs in groups.items() for run in runs], folder / "comparison.csv")
+    by_task = defaultdict(list)
+    for run in read_runs(folder):
+        by_task[run.task].append(run)
+    ordered = sorted(by_task, key=lambda task: ([*REFERENCES, task].index(task), task))
+    tasks = {task: group(by_task[task]) for task in ordered}
+    task_cells = {task: {"task": task} if len(tasks) > 1 else {} for task in tasks}
+    runs = [(task, name, run) for task, groups in tasks.items() for name, same in groups.items() for run in same]
+    cells = [task_cells[task] | _run_cells(name, run) for task, name, run in runs]
+    rows = [task_cells[task] | _csv_row(name, run) for task, name, run in runs]
     path = folder / "comparison.md"
-    write_text(path, _markdown(groups))
+    try:
+        if len(tasks) > 1:
+            draw_suite(tasks, folder / "comparison.png")
+            tables, notes = [_aggregates(tasks), _task_summaries(tasks)], [_LEGEND, _NORMALIZED]
+        else:
+            (groups,) = tasks.values()
+            draw_task(groups, folder / "comparison.png")
+            tables, notes = [_summaries(groups)], [_LEGEND]
+        write_csv(rows, folder / "comparison.csv")
+        write_text(path, "\n".join([*map(_table, [*tables, cells]), *notes]))
+    except OSError as error:
+        raise UserError(f"cannot write to '{folder}': {error.strerror}") from error
     return path
 
 
-def draw_curves(axes: Axes, groups: dict[str, list[LoggedRun]], quantity: str, key: str, unit: float) -> None:
-    """Draw every run thin, the mean of its group bold, and its interval. Dots and stars are of single runs.
-
-    Args:
-        axes: where to draw.
-        groups: runs by label.
-        quantity: `return` or `length`, the vertical axis.
-        key: of a log row, the horizontal axis.
-        unit: of the horizontal axis.
-    """
-    for number, (name, runs) in enumerate(groups.items()):
-        found = [series(run.rows, key, f"episode/{quantity}") for run in runs]
-        curves = [(x / unit, y) for x, y in found if x.size]
-        if not curves:
-            continue
-        color = f"C{number % 10}"
-        for curve in curves:
-            axes.plot(*curve, color=color, alpha=0.35, linewidth=0.8)
-        for run in runs:
-            x, y = evaluations(run.rows, key, quantity)
-            axes.plot(x / unit, y, "o", color=color, markersize=5, markeredgecolor="white", markeredgewidth=0.7)
-            if quantity == "return" and run.score(FINAL):
-                end = (run.rows[-1][key] / unit, run.score(FINAL)["mean"])
-                axes.plot(*end, "*", color=color, markersize=12, markeredgecolor="white", markeredgewidth=0.7, zorder=3)
-        x, mean, values = mean_curve(curves)
-        axes.plot(x, mean, color=color, linewidth=2.2, label=f"{name} ({len(curves)})")
-        bounds = interval(values)
-        if bounds:
-            axes.fill_between(x, *bounds, color=color, alpha=0.2, linewidth=0)
-
-
-def _draw(groups: dict[str, list[LoggedRun]], path: Path) -> None:
-    figure = matplotlib.figure.Figure(figsize=(12, 8), layout="constrained")
-    for axes, quantity, key, unit in learning_axes(figure):
-        draw_curves(axes, groups, quantity, key, unit)
-    task = next(iter(groups.values()))[0].task
-    figure.suptitle(f"{task}. {DRAWN}")
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    if handles:
-        num_columns = max(160 // (len(max(labels, key=len)) + 8), 1)  # as many as fit the figure's width
-        figure.legend(handles, labels, loc="outside lower center", ncols=num_columns, fontsize=9)
-    with replacing(path) as new:
-        figure.savefig(new, dpi=110)
-
-
-def _markdown(groups: dict[str, list[LoggedRun]]) -> str:
-    """A table with two rows per group, for the final and for the best policy, and a table with a row per run."""
-    rows = [_summary(name, runs, policy) for name, runs in groups.items() for policy in (FINAL, BEST)]
-    runs = [run_cells(name, run) for name, same in groups.items() for run in same]
-    return f"{table(rows)}\n{table(runs)}\n{LEGEND}"
-
-
-def table(rows: list[dict[str, str]]) -> str:
+def _table(rows: list[dict[str, str]]) -> str:
     """A Markdown table of at least one row; all rows have the same columns. Cells may hold text of strangers."""
     lines = [list(rows[0]), ["---"] * len(rows[0]), *(map(in_markdown, row.values()) for row in rows)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
+def _summaries(groups: dict[str, list[LoggedRun]]) -> list[dict[str, str]]:
+    """Two rows per group, for the final and for the best policy."""
+    return [_summary(name, runs, policy) for name, runs in groups.items() for policy in (FINAL, BEST)]
+
+
 def _summary(variant: str, runs: list[LoggedRun], policy: str) -> dict[str, str]:
-    scores = np.array([run.score(policy)["mean"] for run in runs if run.score(policy)])
-    low, high = interval(scores) or (None, None)
-    iqm = scipy.stats.trim_mean(scores, 0.25) if len(scores) >= MIN_SEEDS_FOR_IQM else None
+    scores = _scores_of(runs, policy)
+    mean, std, low, high = _statistics(scores)
     return {
         "variant": variant,
         "policy": policy,
-        "score": format_score(scores.mean() if len(scores) else None),
-        "std over seeds": format_score(scores.std(ddof=1) if len(scores) > 1 else None),
-        "95% interval, low": format_score(low),
-        "95% interval, high": format_score(high),
-        "IQM": format_score(iqm),
+        "score": mean,
+        "std over seeds": std,
+        "95% interval, low": low,
+        "95% interval, high": high,
+        "IQM": format_score(scipy.stats.trim_mean(scores, 0.25) if len(scores) >= MIN_SEEDS_FOR_IQM else None),
         "seeds scored": str(len(scores)),
+        **_costs(runs),
+    }
+
+
+def _scores_of(runs: list[LoggedRun], policy: str) -> np.ndarray:
+    """Scores of the runs whose policy was scored, `[N] f64`."""
+    return np.array([run.score(policy)["mean"] for run in runs if run.score(policy)])
+
+
+def _statistics(scores: np.ndarray) -> list[str]:
+    """Mean, sample standard deviation and Student's 95% interval of `[N]` scores, as cells; dashes for too few."""
+    mean = scores.mean() if len(scores) else None
+    std = scores.std(ddof=1) if len(scores) > 1 else None
+    return [format_score(value) for value in (mean, std, *(interval(scores) or (None, None)))]
+
+
+def _costs(runs: list[LoggedRun]) -> dict[str, str]:
+    """Cells about the number of runs and their mean steps and seconds, by column."""
+    return {
         "seeds": str(len(runs)),
         "million steps": f"{np.mean([run.rows[-1]['env_steps'] for run in runs]) / 1e6:,.2f}",
         "seconds": f"{np.mean([run.rows[-1]['wall_seconds'] for run in runs]):,.0f}",
     }
 
 
-def run_cells(variant: str, run: LoggedRun) -> dict[str, str]:
+def _run_cells(variant: str, run: LoggedRun) -> dict[str, str]:
     """Cells about one run, by column."""
     final, best, last = run.score(FINAL), run.score(BEST), run.rows[-1]
     return {
@@ -139,7 +133,7 @@ def run_cells(variant: str, run: LoggedRun) -> dict[str, str]:
     }
 
 
-def csv_row(variant: str, run: LoggedRun) -> dict[str, object]:
+def _csv_row(variant: str, run: LoggedRun) -> dict[str, object]:
     """Values about one run, by column."""
     last = run.rows[-1]
     scores = {f"{policy}_{name}": run.score(policy).get(name) for policy in (FINAL, BEST) for name in ("mean", "std")}
@@ -151,4 +145,58 @@ def csv_row(variant: str, run: LoggedRun) -> dict[str, object]:
         "wall_seconds": last["wall_seconds"],
         "seeds_together": run.seeds_together,
         "run_dir": run.config.run_dir,
+    }
+
+
+def _has_reference(task: str, runs: list[LoggedRun]) -> bool:
+    """Whether the runs are scored in the environment that the references are of."""
+    return task in REFERENCES and all(run.is_standard for run in runs)
+
+
+def _aggregates(tasks: Tasks) -> list[dict[str, str]]:
+    """Two rows per label: normalized scores over all environments that have a reference."""
+    labels = dict.fromkeys(name for groups in tasks.values() for name in groups)
+    return [_aggregate(tasks, name, policy) for name in labels for policy in (FINAL, BEST)]
+
+
+def _aggregate(tasks: Tasks, name: str, policy: str) -> dict[str, str]:
+    scores: defaultdict[int, list[float]] = defaultdict(list)
+    known = [task for task, groups in tasks.items() if name in groups and _has_reference(task, groups[name])]
+    for task in known:
+        for run in tasks[task][name]:
+            if run.score(policy):
+                scores[run.config.seed].append(normalize(task, run.score(policy)["mean"]))
+    complete = [values for values in scores.values() if len(values) == len(known)]
+    means = np.mean(complete, axis=1) if complete else np.zeros(0)
+    has_iqm = complete and len(known) >= _MIN_ENVIRONMENTS_FOR_IQM
+    iqms = scipy.stats.trim_mean(complete, 0.25, axis=1) if has_iqm else np.zeros(0)
+    cells = {"variant": name, "policy": policy}
+    for title, values in (("mean", means), ("IQM", iqms)):
+        mean, _, low, high = _statistics(values)
+        cells |= {f"normalized, {title}": mean, f"{title}, 95% low": low, f"{title}, 95% high": high}
+    return cells | {"environments": str(len(known)), "seeds scored in all": str(len(complete))}
+
+
+def _task_summaries(tasks: Tasks) -> list[dict[str, str]]:
+    """One row per environment and label."""
+    return [_task_summary(task, name, runs) for task, groups in tasks.items() for name, runs in groups.items()]
+
+
+def _task_summary(task: str, name: str, runs: list[LoggedRun]) -> dict[str, str]:
+    final, best = (_scores_of(runs, policy) for policy in (FINAL, BEST))
+    random, reference = REFERENCES[task] if _has_reference(task, runs) else (None, None)
+    mean, std, low, high = _statistics(final)
+    return {
+        "task": task,
+        "variant": name,
+        "final": mean,
+        "std over seeds": std,
+        "95% low": low,
+        "95% high": high,
+        "best": _statistics(best)[0],
+        "random": format_score(random),
+        "reference": format_score(reference),
+        "final, normalized": format_score(normalize(task, final.mean()) if reference and len(final) else None),
+        "best, normalized": format_score(normalize(task, best.mean()) if reference and len(best) else None),
+        **_costs(runs),
     }

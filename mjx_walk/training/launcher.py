@@ -1,7 +1,6 @@
 """`devices=N`: start one process for each GPU of this host. They train one run together."""
 
 import logging
-import os
 import signal
 import socket
 import subprocess
@@ -11,7 +10,7 @@ from pathlib import Path
 
 from mjx_walk.machine.devices import count_devices, only_device
 from mjx_walk.machine.signals import Interrupt, exit_code
-from mjx_walk.machine.subprocesses import python
+from mjx_walk.machine.subprocesses import start_module
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["count", "run"]
@@ -79,18 +78,10 @@ def _start(arguments: list[str], size: int, logs: Path) -> list[subprocess.Popen
         coordinator = f"localhost:{free.getsockname()[1]}"
     processes = []
     for rank in range(size):
-        env = os.environ | {"MJX_WALK_PROCESS": f"{rank},{size},{coordinator}"} | only_device(rank)
+        env = {"MJX_WALK_PROCESS": f"{rank},{size},{coordinator}"} | only_device(rank)
         with _log_file(logs, rank).open("wb") as log:
             output = log if rank else None
-            processes.append(
-                subprocess.Popen(
-                    [*python(), "-m", "mjx_walk.train", *arguments],
-                    env=env,
-                    stdout=output,
-                    stderr=output,
-                    start_new_session=True,
-                )
-            )
+            processes.append(start_module("train", *arguments, env=env, stdout=output, stderr=output))
     return processes
 
 

@@ -8,7 +8,7 @@ import pytest
 from helpers import fake_run
 
 from mjx_walk.envs import TASKS, make_options
-from mjx_walk.experiments import logged_runs, suite
+from mjx_walk.experiments import logged_runs, report, suite
 from mjx_walk.utils.text import format_score
 
 
@@ -25,7 +25,7 @@ def test_runs_are_grouped_by_what_sets_them_apart(tmp_path):
         "ppo, discount=0.99": 2,
         "ppo, discount=0.5": 2,
     }
-    text = suite.write_report(tmp_path).read_text()
+    text = report.write_report(tmp_path).read_text()
     assert "| ppo, discount=0.99 | final | 15.0 | 7.07 | – | – | – | 2 | 2 | 3.00 | 30 |" in text
     assert "| ppo, discount=0.99 | best | 25.0 | 7.07 | – | – | – | 2 | 2 | 3.00 | 30 |" in text
     assert "| ppo, discount=0.5 | final | – | – | – | – | – | 0 | 2 | 2.00 | 20 |" in text
@@ -63,7 +63,7 @@ def test_runs_of_several_environments_are_normalized(tmp_path):
             score = random + (seed + 1) * (reference - random)
             fake_run(tmp_path / env / str(seed), [f"env={env}", f"seed={seed}"], [1, 2], score)
     fake_run(tmp_path / "ant" / "3", ["env=ant", "seed=3"], [1, 2], 5000.0)  # not scored in the others
-    text = suite.write_report(tmp_path).read_text()
+    text = report.write_report(tmp_path).read_text()
     assert "| ppo | final | 2.00 | -0.48 | 4.48 | 2.00 | -0.48 | 4.48 | 4 | 3 |" in text
     assert "| Reacher-v5 | ppo | 32.8 | 37.9 | -61.2 | 126.9 | 42.8 | -42.9 | -5.03 | 2.00 |" in text
     assert "| Ant-v5 | ppo | 3 | 5,000 | 1.00 | 5,010 |" in text
@@ -74,7 +74,7 @@ def test_runs_of_several_environments_are_normalized(tmp_path):
 def test_only_gymnasiums_own_environment_has_a_reference(tmp_path):
     fake_run(tmp_path / "a", ["env=ant", "env.healthy_reward=2"], [1], 100.0)
     fake_run(tmp_path / "b", ["env=hopper", "env.version=v4"], [1], 100.0)
-    text = suite.write_report(tmp_path).read_text()
+    text = report.write_report(tmp_path).read_text()
     assert "| ppo | final | – | – | – | – | – | – | 0 | 0 |" in text
 
 
