@@ -1,4 +1,4 @@
-"""What one Gymnasium environment and the vector environment share: parts, description and pickling."""
+"""Base of the Gymnasium environment and the vector environment: parts, description and pickling."""
 
 from typing import Any
 
