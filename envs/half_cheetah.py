@@ -31,6 +31,8 @@ class HalfCheetah(PlanarBody):
 
     Observation `[17]`: height, torso angle, six joint angles, and nine velocities.
 
+    The reward is in `PlanarBody`: forward velocity and control cost.
+
     Source: `gymnasium/envs/mujoco/half_cheetah_v5.py` and `half_cheetah_v4.py`. The model integrates with Euler.
     """
 

@@ -46,6 +46,8 @@ class Hopper(PlanarWalker):
 
     Observation `[11]`: height, torso angle, three joint angles, and six clipped velocities.
 
+    Reward and termination are in `PlanarWalker`: forward velocity, control cost and the healthy reward.
+
     Source: `gymnasium/envs/mujoco/hopper_v5.py` and `hopper_v4.py`.
     """
 

@@ -34,6 +34,8 @@ class Swimmer(PlanarBody):
 
     Observation `[8]`: angle of the first link, two joint angles, and five velocities.
 
+    The reward is in `PlanarBody`: forward velocity and control cost.
+
     Source: `gymnasium/envs/mujoco/swimmer_v5.py` and `swimmer_v4.py`.
     """
 

@@ -38,6 +38,8 @@ class Walker2d(PlanarWalker):
 
     Observation `[17]`: height, torso angle, six joint angles, and nine clipped velocities.
 
+    Reward and termination are in `PlanarWalker`: forward velocity, control cost and the healthy reward.
+
     Source: `gymnasium/envs/mujoco/walker2d_v5.py` and `walker2d_v4.py`. In v4's model the right foot has friction 0.9.
     """
 

@@ -1,4 +1,4 @@
-"""Recipes in files of the user: `recipe=PATH`."""
+"""Recipes as nodes of Hydra: files of the user, `recipe=PATH`, and recipes of this package without a file."""
 
 import hashlib
 import itertools

@@ -1,6 +1,6 @@
-"""The recipes among the configuration files, and which one applies to a task and an algorithm.
+"""The recipes among the configuration files, and the file that stands for a recipe without one.
 
-`HARDWARE/ENV_ALGO` need not have a file. Without one it takes the settings of `HARDWARE/ALGO`, the defaults there.
+`configs/train.yaml` chooses `HARDWARE/ENV_ALGO`. Without a file, it takes the settings of `HARDWARE/ALGO`, the defaults there.
 """
 
 from pathlib import Path
