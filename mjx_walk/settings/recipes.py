@@ -1,6 +1,7 @@
 """The recipes among the configuration files, and the file that stands for a recipe without one.
 
-`configs/train.yaml` chooses `HARDWARE/ENV_ALGO`. Without a file, it takes the settings of `HARDWARE/ALGO`, the defaults there.
+`configs/train.yaml` chooses `HARDWARE/ENV_ALGO`. Without a file of its own, that recipe takes the settings of
+`HARDWARE/ALGO`, the defaults there.
 """
 
 from pathlib import Path
