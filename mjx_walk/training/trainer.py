@@ -24,7 +24,7 @@ from mjx_walk.training.call_profile import CallProfile
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.messages import end_lines, score_lines
 from mjx_walk.training.programs import compile_together, make_program
-from mjx_walk.training.recorder import Recorder, reporting_failed_writes
+from mjx_walk.training.recorder import Recorder
 from mjx_walk.training.restoring import restore_runs
 from mjx_walk.training.scoring import Policies, final_and_best, score_run
 from mjx_walk.utils.errors import UserError
@@ -68,7 +68,8 @@ class Trainer:
         self._filmers = [Filmer(*run) for run in zip(configs, folders, strict=True)] if films else []
         self._steps_per_iteration = algorithm.steps_per_iteration * processes.process_count
         self._steps_per_call = self._steps_per_iteration * config.iterations_per_call
-        self._num_calls = -(-config.total_steps // self._steps_per_call)
+        self._first_steps = 0
+        """Environment steps that do not fill a call, on another number of devices before a resume."""
         self._seeds = [own.seed for own in configs]
         self._keys = [jax.random.PRNGKey(seed) for seed in self._seeds]
         self._on_metrics = on_metrics or (lambda row: None)
@@ -82,22 +83,22 @@ class Trainer:
         """Train to the end, or until a stop signal.
 
         Returns:
-            None at the end, otherwise the name of the signal. The states are saved in both cases.
+            None at the end, otherwise the name of the signal. `score` and `close` wait until the states are saved.
 
         Raises:
             UserError: training has diverged, so that a network, an optimizer or a running statistic is not finite.
         """
         restored, metadata = self._restored()
-        call = metadata[0].get("env_steps", 0) // self._steps_per_call
+        call, self._first_steps = divmod(metadata[0].get("env_steps", 0), self._steps_per_call)
         self._say_total(call)
-        total_steps, is_main = self._num_calls * self._steps_per_call, self._processes.is_main_process
-        progress = Progress(total_steps, call * self._steps_per_call, is_main)
+        is_main = self._processes.is_main_process
+        progress = Progress(self._env_steps(self._num_calls), self._env_steps(call), is_main)
         profile = CallProfile(self._folders[0].profile, self._config.profile_calls if is_main else 0)
         state = self._ready_to_call(restored, call)
         speed = Speed(call)
         for recorder, facts in zip(self._recorders, metadata, strict=True):
-            recorder.begin(call * self._steps_per_call, call < self._num_calls, facts)
-        saved_call, is_finite = call or -1, True
+            recorder.begin(self._env_steps(call), call < self._num_calls, facts)
+        saved_call, is_finite = call if restored is not None else None, True
         with Interrupt() as interrupt, profile:
             signal_name = self._stop_signal(interrupt)
             while call < self._num_calls and is_finite and not signal_name:
@@ -115,8 +116,9 @@ class Trainer:
                 signal_name = self._stop_signal(interrupt)
             if saved_call != call:
                 self._save(state, call, progress)
+                signal_name = signal_name or self._stop_signal(interrupt)
         progress.close()
-        self._finish(state, call, is_complete=is_finite and not signal_name)
+        self._finish(state, call, is_finite, is_complete=is_finite and not signal_name)
         if not is_finite:
             raise UserError(self._divergence(state, call))
         return signal_name
@@ -131,8 +133,7 @@ class Trainer:
         is_main = self._processes.is_main_process
         if num_episodes and is_main:
             where = "Gymnasium, on the CPU" if task.is_in_gymnasium else f"physics={task.engine.name}"
-            episodes = "episode" if num_episodes == 1 else "episodes"
-            _LOGGER.info("Scoring %d %s of each policy in %s", num_episodes, episodes, where)
+            _LOGGER.info(f"Scoring {num_episodes} episode{'s' * (num_episodes > 1)} of each policy in {where}")
         try:
             if num_episodes and self._policies:
                 self._score_runs(num_episodes, seconds)
@@ -156,9 +157,17 @@ class Trainer:
         self._seconds_before = max(metadata["wall_seconds"] for _, metadata in restored)
         return self._program.merge([state for state, _ in restored]), [metadata for _, metadata in restored]
 
+    @property
+    def _num_calls(self) -> int:
+        return -(-(self._config.total_steps - self._first_steps) // self._steps_per_call)
+
+    def _env_steps(self, call: int) -> int:
+        """Environment steps of a run after so many calls."""
+        return self._first_steps + call * self._steps_per_call
+
     def _say_total(self, call: int) -> None:
-        """Log whether the run is finished already, and the steps that it really trains."""
-        total, steps = self._config.total_steps, self._num_calls * self._steps_per_call
+        """Log whether the run is already complete, or whether `total_steps` is rounded up."""
+        total, steps = self._config.total_steps, self._env_steps(self._num_calls)
         if not self._processes.is_main_process:
             return
         if call >= self._num_calls:
@@ -189,7 +198,7 @@ class Trainer:
 
     def _rows(self, call: int, metrics: list[Metrics], speed: Speed) -> list[Row]:
         """The row of each run at the end of a call."""
-        common = {"env_steps": call * self._steps_per_call, "wall_seconds": self._seconds()}
+        common = {"env_steps": self._env_steps(call), "wall_seconds": self._seconds()}
         speeds = {
             "speed/steps_per_second": speed.after(call) * self._steps_per_call,
             "speed/seeds_together": float(len(self._seeds)),
@@ -212,10 +221,9 @@ class Trainer:
         if not self._filmers or not any("eval/return" in row for row in rows):
             return
         policies = self._program.split(self._algorithm.policy_params(state))
-        for filmer, folder, policy, row in zip(self._filmers, self._folders, policies, rows, strict=True):
+        for filmer, policy, row in zip(self._filmers, policies, rows, strict=True):
             if "eval/return" in row:
-                with reporting_failed_writes(folder):
-                    filmer.take(policy, int(row["env_steps"]))
+                filmer.take(policy, int(row["env_steps"]))
 
     def _save(self, state: TrainState, call: int, progress: Progress) -> None:
         """Save the TrainState of every run that is finite."""
@@ -226,27 +234,31 @@ class Trainer:
         states, are_finite, seconds = self._program.split(state), self._program.is_finite(state), self._seconds()
         for recorder, own, is_finite in zip(self._recorders, states, are_finite, strict=True):
             if is_finite:
-                recorder.save(own, call * self._steps_per_call, seconds)
+                recorder.save(own, self._env_steps(call), seconds)
 
-    def _finish(self, state: TrainState, call: int, is_complete: bool) -> None:
+    def _finish(self, state: TrainState, call: int, is_finite: bool, is_complete: bool) -> None:
         """Close the logs and draw the curves. After a complete training, choose the best policy of each run."""
         for recorder in self._recorders:
             recorder.close_logs()
-        states = self._program.split(without_replay(state))
         if self._processes.is_main_process:
+            if is_complete:
+                self._choose_policies(state, call)
             self._draw_curves()
-        if self._processes.is_main_process and is_complete:
-            env_steps = call * self._steps_per_call
-            self._policies = final_and_best(self._algorithm, states, self._seeds, env_steps, self._steps_per_iteration)
-            for recorder, policies in zip(self._recorders, self._policies, strict=True):
-                if policies[BEST] is policies[FINAL]:
-                    recorder.save_best(*policies[BEST])
         if is_complete and len(self._folders) * self._processes.process_count == 1:
             return  # a single folder is saved while the policies are scored
         self._wait_for_files()
         self._processes.wait_for_all()
-        for recorder in self._recorders:
+        # After a divergence, only some runs may have saved. All need their newest common checkpoint.
+        for recorder in self._recorders if is_finite else ():
             recorder.prune()
+
+    def _choose_policies(self, state: TrainState, call: int) -> None:
+        """Keep the final and the best policy of each run for `score`. Save the final one if it is the best."""
+        states, env_steps = self._program.split(without_replay(state)), self._env_steps(call)
+        self._policies = final_and_best(self._algorithm, states, self._seeds, env_steps, self._steps_per_iteration)
+        for recorder, policies in zip(self._recorders, self._policies, strict=True):
+            if policies[BEST] is policies[FINAL]:
+                recorder.save_best(*policies[BEST])
 
     def _draw_curves(self) -> None:
         from mjx_walk.viewing.run_plots import plot_run  # imports Matplotlib, which slows the start
@@ -260,7 +272,7 @@ class Trainer:
     def _score_runs(self, num_episodes: int, training_seconds: float) -> None:
         """Score the policies of each run, and log their scores."""
         acting = in_float32(self._algorithm)
-        total_steps = self._num_calls * self._steps_per_call
+        total_steps = self._env_steps(self._num_calls)
         for seed, folder, policies in zip(self._seeds, self._folders, self._policies, strict=True):
             scored = score_run(acting, policies, folder, num_episodes, training_seconds)
             for line in score_lines(scored, total_steps, seed if len(self._seeds) > 1 else None):
@@ -280,8 +292,8 @@ class Trainer:
             names = [name for name, leaf in learned_leaves(own).items() if not jnp.isfinite(leaf).all()]
             found += [f"{name} of seed {seed}" for name in names[:1]]
         return (
-            f"training has diverged: after {call * self._steps_per_call:,} steps {', '.join(found)} is not finite; "
-            "earlier checkpoints are kept; lower the learning rate or clip gradients, then resume or start a new run"
+            f"training has diverged: after {self._env_steps(call):,} steps {', '.join(found)} is not finite; "
+            "earlier checkpoints are kept; start a new run with a lower learning rate, or clip gradients"
         )
 
     def _seconds(self) -> float:

@@ -1,6 +1,7 @@
 """Films of a policy during training, as MP4 files and in TensorBoard; a child process on the CPU makes them."""
 
 import io
+import logging
 import os
 import shutil
 import subprocess
@@ -25,6 +26,7 @@ from mjx_walk.viewing.rendering import write_film
 
 __all__ = ["Filmer", "film"]
 
+_LOGGER = logging.getLogger(__name__)
 _SIZE = (320, 240)
 _FRAMES_PER_SECOND = 25.0
 _SECONDS_IN_TENSORBOARD = 5.0
@@ -46,15 +48,18 @@ class Filmer:
         self._process: subprocess.Popen | None = None
 
     def take(self, policy_params: PolicyParams, env_steps: int) -> None:
-        """Start to film a policy, unless the previous film is still being made."""
+        """Start to film a policy, unless the previous film is still being made. Warn if this fails."""
         if self._process and self._process.poll() is None:
             return
         film = RunFolder(self._folder.path / "films" / str(env_steps))
-        film.path.mkdir(parents=True, exist_ok=True)
-        save_config(self._config, film.config)
         params = jax.device_get(policy_params)
-        checkpoint.save(film.policy(FINAL), params, {"env_steps": env_steps}, as_numpy=True)
-        self._process = start_module("viewing.film", str(film.path), env={"JAX_PLATFORMS": "cpu"})
+        try:
+            film.path.mkdir(parents=True, exist_ok=True)
+            save_config(self._config, film.config)
+            checkpoint.save(film.policy(FINAL), params, {"env_steps": env_steps}, as_numpy=True)
+            self._process = start_module("viewing.film", str(film.path), env={"JAX_PLATFORMS": "cpu"})
+        except OSError as error:  # a film is no reason to end a training
+            _LOGGER.warning(f"cannot film step {env_steps:,} of {self._folder.path}: {error}")
 
     def wait(self) -> None:
         """Wait until the last film is finished."""

@@ -189,6 +189,15 @@ def test_two_processes_learn_the_same_and_resume_exactly(tmp_path, tiny):
 
 
 @pytest.mark.slow
+def test_steps_that_fill_no_call_of_more_devices_are_counted(tmp_path):
+    run(tmp_path, f"total_steps={3 * TINY_CALL}", devices=1)
+    run(tmp_path, f"total_steps={7 * TINY_CALL}", "resume=true")
+    steps = [row["env_steps"] // TINY_CALL for row in read_rows(tmp_path / "metrics.jsonl")]
+    assert steps == [1, 2, 3, 5, 7]
+    assert checkpoint.list_steps(tmp_path / "checkpoints")[-1].name == f"{7 * TINY_CALL:013d}"
+
+
+@pytest.mark.slow
 def test_a_process_that_fails_ends_the_run_which_resumes_from_its_checkpoint(tmp_path):
     settings = [*TINY, f"run_dir={tmp_path}/run", "devices=2"]
     parent = start("train", *settings, "checkpoint.every_calls=1", f"total_steps={60 * CALL}")

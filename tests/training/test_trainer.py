@@ -1,6 +1,8 @@
 """The loop: what it reports and saves, when, and how it ends."""
 
 import dataclasses
+import os
+import signal
 import threading
 
 import jax
@@ -20,7 +22,8 @@ from mjx_walk.settings.config import load_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.training import programs
 from mjx_walk.training.checks import prepared
-from mjx_walk.training.programs import make_init, make_step
+from mjx_walk.training.programs import SeedsProgram, make_init, make_step
+from mjx_walk.training.trainer import Trainer
 from mjx_walk.utils.errors import UserError
 
 
@@ -153,6 +156,37 @@ def test_only_seeds_whose_networks_are_finite_are_saved(tmp_path, monkeypatch):
         train_command.main([*TINY, f"run_dir={tmp_path}", "seeds=[3,5]", f"total_steps={50 * TINY_CALL}"])
     assert len(list((tmp_path / "seed_3" / "checkpoints").glob("0*"))) == 1
     assert not list((tmp_path / "seed_5" / "checkpoints").iterdir())
+
+
+def test_runs_keep_their_common_checkpoint_when_one_of_them_diverges(tmp_path, monkeypatch):
+    """With a single checkpoint to keep, the finite run would else remove the one that both have."""
+    calls = 0
+
+    def is_finite(self, state):
+        nonlocal calls
+        calls += 1
+        return np.array([True, calls <= 2])  # in the loop, and in the save, of each call
+
+    monkeypatch.setattr(SeedsProgram, "is_finite", is_finite)
+    arguments = [f"run_dir={tmp_path}", "checkpoint.every_calls=1", "checkpoint.max_to_keep=1", "seeds=[3,5]"]
+    with pytest.raises(UserError, match="training has diverged: after 128 steps"):
+        train_command.main([*TINY, *arguments, f"total_steps={50 * TINY_CALL}"])
+    steps = [checkpoint.list_steps(tmp_path / f"seed_{seed}" / "checkpoints") for seed in (3, 5)]
+    assert [[int(path.name) for path in own] for own in steps] == [[TINY_CALL, 2 * TINY_CALL], [TINY_CALL]]
+
+
+def test_a_signal_during_the_last_save_stops_before_the_score(tmp_path, monkeypatch):
+    save = Trainer._save
+
+    def save_and_stop(self, *arguments):
+        save(self, *arguments)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Trainer, "_save", save_and_stop)
+    arguments = [*TINY, f"run_dir={tmp_path}", f"total_steps={TINY_CALL}", "evaluation.gymnasium_episodes=1"]
+    assert train_command.main(arguments) == 128 + signal.SIGTERM
+    assert not (tmp_path / "eval_gymnasium.json").exists()
+    assert [int(path.name) for path in checkpoint.list_steps(tmp_path / "checkpoints")] == [TINY_CALL]
 
 
 def test_an_error_in_the_loop_finishes_the_checkpoint_that_is_being_written(tmp_path, monkeypatch):

@@ -9,7 +9,10 @@ from helpers import TINY, TINY_CALL, command, renders
 from tensorboardX.proto.event_pb2 import Event
 
 from mjx_walk import api
+from mjx_walk.settings.config import load_config
+from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.viewing import rendering
+from mjx_walk.viewing.film import Filmer
 
 
 def films_in_tensorboard(run_dir):
@@ -45,6 +48,12 @@ def test_evaluations_are_filmed(tmp_path):
         assert frames > 5 and seconds > 0.2
         gif = iio.imread(shown[int(film.stem)], extension=".gif", index=None)
         assert gif.shape[1:] == (240, 320, 3) and len(gif) == -(-frames // 2)
+
+
+def test_a_film_that_cannot_be_written_is_no_error(tmp_path, caplog):
+    (tmp_path / "films").write_text("a file")
+    Filmer(load_config([*TINY, "hardware=cpu"]), RunFolder(tmp_path)).take({}, 5)
+    assert f"cannot film step 5 of {tmp_path}: " in caplog.text
 
 
 def test_where_nothing_renders_nothing_is_begun(tmp_path, monkeypatch):
