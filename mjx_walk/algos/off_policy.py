@@ -194,9 +194,9 @@ class OffPolicyAlgorithm(
             reward_scale *= returns.reward_multiplier(return_scale, config.normalized_return_max)
         replay = self.buffer.insert(state.replay, steps)
         rate_factor = schedule_factor(config.learning_rate_schedule, remaining)
-        settings = functools.partial(Batch, reward_scale=reward_scale, rate_factor=rate_factor, remaining=remaining)
-        learn = functools.partial(self._train, settings, replay, normalizer, discount, update_key)
-        train = jax.jit(learn, inline=True)  # traced once for both branches
+        make_batch = functools.partial(Batch, reward_scale=reward_scale, rate_factor=rate_factor, remaining=remaining)
+        update = functools.partial(self._train, make_batch, replay, normalizer, discount, update_key)
+        train = jax.jit(update, inline=True)  # traced once for both branches
         can_learn = replay.rows >= self.rows_before_learning
         learner, metrics = jax.lax.cond(can_learn, train, functools.partial(_wait, train), state.learner)
         new_state = state.replace(
@@ -218,7 +218,7 @@ class OffPolicyAlgorithm(
 
     def _train(
         self,
-        settings: functools.partial[Batch],
+        make_batch: functools.partial[Batch],
         replay: Replay,
         normalizer: RunningStatisticsState,
         discount: Float[Array, ""] | float,
@@ -230,13 +230,13 @@ class OffPolicyAlgorithm(
 
         def critic_update(learner, inputs):
             transitions, key = inputs
-            return self.critic_update(learner, settings(transitions), key)[0], None
+            return self.critic_update(learner, make_batch(transitions), key)[0], None
 
         def policy_period(learner, inputs):
             first = jax.tree.map(lambda x: x[:-1], inputs)
             learner, _ = jax.lax.scan(critic_update, learner, first)
             transitions, key = jax.tree.map(lambda x: x[-1], inputs)
-            return self.full_update(learner, settings(transitions), key)
+            return self.full_update(learner, make_batch(transitions), key)
 
         # Sampled and normalized at once: on a GPU, small updates wait for the launch of their kernels.
         sample_key, key = jax.random.split(key)
@@ -258,6 +258,6 @@ def _keep(step: rollout.Step) -> Steps:
 
 
 def _wait(train: Callable[[LearnerT], tuple[LearnerT, Losses]], learner: LearnerT) -> tuple[LearnerT, Losses]:
-    """The learner as it is, and zeros for metrics, before learning starts."""
+    """The unchanged learner, and zeros for metrics, before learning starts."""
     shapes = jax.eval_shape(train, learner)[1]
     return learner, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)

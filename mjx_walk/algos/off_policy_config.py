@@ -41,7 +41,7 @@ class OffPolicyConfig:
     critic_learning_rate: float = setting(3e-4, above=0)
     """Step size of Adam for the critics."""
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear"))
-    """`linear`: falls to zero over `schedule_steps`."""
+    """`linear`: the rates of policy and critics fall to zero over `schedule_steps`."""
     schedule_steps: int = setting(
         100_000_000,
         at_least=1,

@@ -145,7 +145,7 @@ class OnPolicyAlgorithm(Algorithm[OnPolicyState, OnPolicyBatch, _OnPolicyConfigT
         (env, evaluation, exploration), (transitions, reward, done, last_obs, metrics) = jax.lax.scan(
             unroll, carry, jax.random.split(run_key, config.num_unrolls)
         )
-        # Where an episode ended at the last step of an unroll, last_obs belongs to the next one: its discount is 0.
+        # If an episode ends at the last step of an unroll, last_obs starts the next one. Its discount is 0.
         transitions = jax.tree.map(_unrolls_first, transitions)
         transitions = transitions._replace(next_observation=last_obs.reshape((-1, 1, last_obs.shape[-1])))
         batch = OnPolicyBatch(
@@ -258,7 +258,7 @@ class OnPolicyAlgorithm(Algorithm[OnPolicyState, OnPolicyBatch, _OnPolicyConfigT
 
 
 def _unrolls_first(x: Shaped[Array, "U T B *rest"]) -> Shaped[Array, "U*B T *rest"]:
-    """One axis of unrolls and environments, before that of steps."""
+    """Merge unrolls and environments into one leading axis, before the steps."""
     x = jnp.swapaxes(x, 1, 2)
     return x.reshape((-1, *x.shape[2:]))
 

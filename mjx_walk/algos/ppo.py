@@ -42,6 +42,8 @@ class PPOConfig(OnPolicyConfig):
 class PPO(OnPolicyAlgorithm[PPOConfig]):
     """Several epochs of minibatches on Brax's clipped loss.
 
+    Deviation: Brax's loss estimates and normalizes advantages in every minibatch, with the current value network.
+
     Raises:
         UserError: the batch cannot be split evenly into minibatches; or see `require_several_gradient_steps`.
     """

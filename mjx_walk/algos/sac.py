@@ -30,7 +30,7 @@ class SACConfig(OffPolicyConfig):
     init_alpha: float = setting(1.0, above=0)
     """Initial temperature."""
     alpha_learning_rate: float = setting(3e-4, above=0)
-    """Step size of Adam for the temperature."""
+    """Step size of Adam for the temperature. It stays constant."""
     target_entropy: float = setting(-0.5, below=0.69)
     """Entropy at which the temperature keeps the policy, in nats per action dimension; Brax uses -0.5. Actions lie in
     `[-1, 1]`, so no policy has more than ln 2, and under a higher target the temperature would grow without bound."""
@@ -104,7 +104,7 @@ class SAC(OffPolicyAlgorithm[SACState, SACConfig]):
         return self.act(params, obs, key, deterministic=False)
 
     def losses(self, batch: Batch) -> SACLosses:
-        """Brax's losses, with the target entropy of the moment."""
+        """Brax's losses, with the scheduled target entropy."""
         first, last = self.config.target_entropy, self.config.final_target_entropy
         target_entropy = jnp.float32(first) if last is None else last + (first - last) * batch.remaining
         return make_sac_losses(self.nets, batch.reward_scale, target_entropy, self.task.action_size)

@@ -56,7 +56,7 @@ class Program(Protocol):
         ...
 
     def split(self, tree: Any) -> list[Any]:
-        """The part of each run of a state, or of a pytree from it; on the host if there is an axis of runs."""
+        """Split a state, or a pytree from it, into one tree for each run. With an axis of runs, on the host."""
         ...
 
     def merge(self, states: list[TrainState]) -> TrainState:
@@ -178,7 +178,7 @@ def _stack(trees: list[Any]) -> Any:
 
 
 def make_init(init: Callable[[jax.Array], TrainState]) -> jax.stages.Wrapped:
-    """Compile `key → TrainState` without weak types, with which the first call would compile twice."""
+    """Compile `key → TrainState` without weak types. With them, the step would compile again in the second call."""
     return jax.jit(functools.partial(_strong_init, init))
 
 

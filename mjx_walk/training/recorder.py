@@ -49,12 +49,12 @@ class Recorder:
         self._seeds_together = seeds_together
         self._steps_per_iteration = algorithm.steps_per_iteration * processes.process_count
         self._checkpoints = device_folder(folder.checkpoints, processes.process_index)
-        # A kill may leave some of several folders one checkpoint ahead. They go back to the one before.
+        # A kill during a save leaves some folders one checkpoint ahead. All resume from the newest common one.
         is_saved_with_others = seeds_together > 1 or processes.process_count > 1
         self._saver = BackgroundSaver(
             self._checkpoints, config.checkpoint.max_to_keep, as_yaml(config), prune_first=is_saved_with_others
         )
-        self._best_iteration = -1
+        self._saved_best_iteration = -1
         self._writer: MetricsWriter | None = None
         self._wandb: WandbLog | None = None
 
@@ -104,8 +104,8 @@ class Recorder:
             final = self._algorithm.policy_params(state)
             parts.insert(0, Part(self._folder.policy(FINAL), final, {"env_steps": env_steps}))
             best = best_policy(state, self._steps_per_iteration)
-            if best and int(state.evaluation.best_iteration) != self._best_iteration:
-                self._best_iteration = int(state.evaluation.best_iteration)
+            if best and int(state.evaluation.best_iteration) != self._saved_best_iteration:
+                self._saved_best_iteration = int(state.evaluation.best_iteration)
                 parts.insert(0, Part(self._folder.policy(BEST), *best))
         with reporting_failed_writes(self._folder):
             if self._writer:
@@ -118,7 +118,7 @@ class Recorder:
             self._saver.save(Part(self._folder.policy(BEST), policy_params, metadata))
 
     def wait(self) -> None:
-        """Wait until the last save is complete. Before that, another run of the program may need the one before it."""
+        """Wait until the current save is on disk. Until every run has saved, the others may need the one before it."""
         with reporting_failed_writes(self._folder):
             self._saver.wait()
 
@@ -128,7 +128,7 @@ class Recorder:
             self._saver.prune()
 
     def close_logs(self) -> None:
-        """Close the logs. What is saved later does not reach them."""
+        """Close the logs. Checkpoints that are saved later record no position in them."""
         writer, self._writer = self._writer, None
         wandb, self._wandb = self._wandb, None
         if writer:

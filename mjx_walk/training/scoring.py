@@ -29,8 +29,8 @@ def final_and_best(
 ) -> list[Policies]:
     """The policies of each run that has trained to its end.
 
-    The evaluations during training have not reached the final policy yet, so it has its own evaluation here, in as many
-    environments. If that is the highest one, the final policy is also the best.
+    Inline evaluation has not scored the final policy. It is evaluated here, in as many environments. If its return is
+    the highest, the final policy is also the best.
 
     Args:
         algorithm: algorithm of one run.
