@@ -322,6 +322,20 @@ def test_pairs_of_geoms_are_found_once_per_model(monkeypatch):
         assert len([*collision_driver.geom_pairs(model)]) == num_pairs
 
 
+def test_the_pairs_depend_on_nothing_but_the_arrays_that_identify_a_model():
+    """A later MJX might read more."""
+    read = set()
+
+    class Reader:
+        def __getattr__(self, name):
+            read.add(name)
+            return getattr(model, name)
+
+    model = load({"shin": 'contype="3"'})
+    assert [*static_pairs._UPSTREAM(Reader())]
+    assert read - {"npair", "nbody", "opt"} <= {*static_pairs._READ_BY_UPSTREAM}
+
+
 @pytest.mark.parametrize(
     ("flags", "kept"), [((), (True, True)), (("spring",), (False, True)), (("damper",), (True, False))]
 )
