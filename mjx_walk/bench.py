@@ -48,7 +48,9 @@ class Arguments:
 def main(command_line: list[str]) -> None:
     """Measure, print a table, and write JSON if asked."""
     if any(argument.partition("=")[0] == "peers" for argument in command_line):
-        raise UserError("peers is now a program of the repository: python benchmarks/peers.py algo=ppo")
+        raise UserError(
+            "bench does not measure peers; in a clone of the repository, run python benchmarks/peers.py algo=ppo"
+        )
     arguments, overrides = parsing.parse_own(Arguments, Config, command_line, USAGE, key_of_value)
     config = resolve(overrides)
     if arguments.out:

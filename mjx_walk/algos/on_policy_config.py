@@ -23,8 +23,8 @@ class OnPolicyConfig:
     learning_rate: float = setting(3e-4, above=0)
     """Step size of Adam, for policy and value network."""
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
-    """`linear`: falls to zero over `schedule_steps`. `adaptive_kl`: falls, too, and adapts the policy's rate after each
-    batch, so that a batch moves the policy by a KL of about `target_kl`."""
+    """`linear`: falls to zero over `schedule_steps`. `adaptive_kl`: as `linear`, and the policy's rate is adapted
+    after each batch, so that a batch moves the policy by a KL of about `target_kl`."""
     target_kl: float = setting(0.01, above=0, only_if={"learning_rate_schedule": "adaptive_kl"})
     """KL divergence of one batch that `adaptive_kl` aims at."""
     schedule_steps: int = setting(

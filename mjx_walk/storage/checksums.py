@@ -49,7 +49,7 @@ def read_json(path: Path, max_bytes: int) -> dict[str, Any]:
     """Content of a JSON file that holds an object.
 
     Raises:
-        ValueError: it is too large, nested too deeply, no JSON in UTF-8, or no object.
+        ValueError: it is too large, nested too deeply, not JSON in UTF-8, or not an object.
         OSError: it is not a regular file, or cannot be read.
     """
     try:
@@ -59,7 +59,7 @@ def read_json(path: Path, max_bytes: int) -> dict[str, Any]:
     if not _is_shallow(content, _MAX_DEPTH):
         raise ValueError("it is nested too deeply")
     if not isinstance(content, dict):
-        raise ValueError("it is no JSON object")
+        raise ValueError("it is not a JSON object")
     return content
 
 

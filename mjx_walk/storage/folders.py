@@ -30,7 +30,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     places = {folder: _identity(folder) for folder in (unfinished, *path.parents)}
     try:
         yield unfinished
-        if _identity(unfinished) != places[unfinished]:  # TensorStore makes missing folders anew
+        if _identity(unfinished) != places[unfinished]:  # TensorStore creates missing folders
             raise FileNotFoundError(errno.ENOENT, "a folder above was moved or removed", str(path))
         sync_tree(unfinished)
         if path.exists():
@@ -46,7 +46,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
             _remove(former)
         _remove(unfinished)
         for folder in path.parents:
-            if _identity(folder) not in (places[folder], None):  # made anew, too
+            if _identity(folder) not in (places[folder], None):  # created again, too
                 with contextlib.suppress(OSError):
                     folder.rmdir()  # if it is empty
 

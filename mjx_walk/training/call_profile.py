@@ -60,7 +60,7 @@ class CallProfile:
         self._is_recording = False
         try:
             if not self._folder.parent.exists():
-                raise OSError("its run folder was removed")  # the profiler would make it anew
+                raise OSError("its run folder was removed")  # the profiler would create it again
             jax.profiler.stop_trace()
         except (OSError, RuntimeError) as error:
             _LOGGER.warning(f"cannot write the recording of calls to {self._folder}: {first_line(error)}")

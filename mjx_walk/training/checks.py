@@ -61,7 +61,7 @@ def as_saved(config: Config, overrides: list[str]) -> Config:
     project = saved.wandb_project
     if project and "wandb_project" not in given:
         named = shlex.quote(f"wandb_project={project}")
-        raise UserError(f"the saved run logs to Weights & Biases; to go on, add {named}, or wandb_project=null")
+        raise UserError(f"the saved run logs to Weights & Biases; to continue, add {named}, or wandb_project=null")
     for key in given - {"hardware"} | {"run_dir", "resume"}:
         saved = with_setting(saved, key, operator.attrgetter(key)(config))
     return saved
@@ -213,7 +213,7 @@ def _check(folder: RunFolder, config: Config) -> None:
 
 
 def _has_begun(folder: RunFolder) -> bool:
-    """Whether a folder holds more than a run leaves that ends before it has saved its configuration."""
+    """Whether a folder holds files other than those of a run that ended before it saved its configuration."""
     if not folder.path.exists():
         return False
     return any(not _is_left_over(folder, path) for path in folder.path.iterdir())

@@ -149,7 +149,7 @@ def test_a_save_replaces_a_file_in_place_of_a_checkpoint(tmp_path):
 def test_a_saved_project_of_weights_and_biases_is_used_only_if_it_is_named(downloaded):
     change(downloaded, "wandb_project: null", "wandb_project: theirs")
     resume = [f"run_dir={downloaded}", "resume=true"]
-    with pytest.raises(UserError, match="to go on, add wandb_project=theirs, or wandb_project=null"):
+    with pytest.raises(UserError, match="to continue, add wandb_project=theirs, or wandb_project=null"):
         api.resolve(resume)
     assert api.resolve([*resume, "wandb_project=theirs"]).wandb_project == "theirs"
     assert api.resolve([*resume, "wandb_project=null"]).wandb_project is None
