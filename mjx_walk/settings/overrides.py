@@ -40,8 +40,6 @@ def read_overrides(overrides: list[str], is_sweep: bool = False) -> list[Overrid
         UserError: `+key`, `++key` or `~key`, a malformed override, or an unknown environment or algorithm.
     """
     overrides = _with_named_task(present_overrides(overrides))
-    if not any(override.startswith("hardware=") for override in overrides):
-        overrides = [f"hardware={'cpu' if default_backend() == 'cpu' else 'gpu'}", *overrides]
     read = []
     for text in _in_hydras_grammar(overrides, is_sweep):
         override = _read(text)
@@ -50,6 +48,9 @@ def read_overrides(overrides: list[str], is_sweep: bool = False) -> list[Overrid
         if not override.key_or_group.startswith("hydra"):
             _check(override)
         read.append(override)
+    if not any(override.key_or_group == "hardware" for override in read):
+        size = "cpu" if default_backend() == "cpu" else "gpu"  # JAX starts only after mistakes are reported
+        read = [*OverridesParser.create().parse_overrides([f"hardware={size}"]), *read]
     return read
 
 
