@@ -58,9 +58,9 @@ def explain(error: BaseException, overrides: list[Override]) -> str:
     missing = re.search(r"Could not find '(\w+)/(.*?)'", texts[0])
     if missing and missing[1] in _GROUPS:
         return _unknown_choice(missing[1], missing[2], env, algo)
-    ambiguous = re.search(r"Ambiguous value for argument '(.*?)=(.*)'", texts[0])
-    if ambiguous:
-        return _several_values(ambiguous[1], ambiguous[2], types)
+    sweep = re.search(r"(?:Ambiguous value for argument|Sweep parameters) '(.*?)=(.*)'", texts[0])
+    if sweep:
+        return _several_values(sweep[1], sweep[2], types)
     full_key = getattr(error, "full_key", None) or getattr(error.__cause__, "full_key", None)
     key = re.sub(r"\[\d+\]$", "", full_key or "")
     detail = first_line(error.__cause__ or error)
@@ -164,9 +164,9 @@ def _unknown_choice(group: str, value: str, env: str, algo: str) -> str:
 
 
 def _several_values(key: str, text: str, types: dict[str, object]) -> str:
-    """The error for several values with commas, outside a sweep."""
+    """The error for several values, with commas or as `choice(1,2)`, outside a sweep."""
     mistake = type_mistake(key, text, types.get(key)) or ""
     if "; write " in mistake:
         return mistake
-    alternative = f"write seeds=[{text}]" if key == "seed" else "add -m"
+    alternative = f"write seeds=[{text}]" if key == "seed" and "(" not in text else "add -m"
     return f"{key}={text} gives several values; give one, or {alternative} to train a run with each"

@@ -5,7 +5,7 @@ import re
 from collections.abc import Collection, Iterator
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep, Override, Quote, QuotedString, Sweep
+from hydra.core.override_parser.types import ChoiceSweep, Glob, Override, Quote, QuotedString, Sweep
 from hydra.errors import HydraException
 
 from mjx_walk.algos import ALGORITHMS
@@ -116,6 +116,8 @@ def _check(override: Override) -> None:
     key, text = override.key_or_group, str(override.input_line)
     if override.is_add() or override.is_force_add() or override.is_delete():
         raise UserError(f"'{text}': keys cannot be added or removed; write {key}={text.partition('=')[2] or 'VALUE'}")
+    if isinstance(override.value(), Glob):
+        raise UserError(f"{text}: glob is not supported; list the values with commas, and add -m to train with each")
     if key in ("hardware", "recipe") and not override.is_sweep_override() and not isinstance(override.value(), str):
         raise UserError(f"{text}: give one name, or leave {key}= out")
     names: dict[str, Collection[str]] = {"env": TASKS, "algo": ALGORITHMS}
