@@ -10,11 +10,13 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float, Int
 
 from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
 from mjx_walk.envs.models import warn_of_changed_sources
 from mjx_walk.evaluation.gymnasium_worker import send
+from mjx_walk.evaluation.perturbations import Perturbation
 from mjx_walk.logs.progress import ScoringProgress
 from mjx_walk.machine.signals import undisturbed
 from mjx_walk.machine.subprocesses import start_module
@@ -22,7 +24,7 @@ from mjx_walk.storage.scores import Scores
 from mjx_walk.utils.setting_fields import MAX_SEED, setting
 from mjx_walk.utils.types import Act, PolicyFn
 
-__all__ = ["Episodes", "ScoreRequest", "compile_episodes", "score_in_gymnasium", "score_in_sim"]
+__all__ = ["Episodes", "ScoreRequest", "compile_episodes", "play_in_gymnasium", "score_in_gymnasium", "score_in_sim"]
 
 _MAX_PARALLEL_EPISODES = 1024
 """Episodes played at once; an environment takes about 1 MB."""
@@ -57,31 +59,53 @@ def score_in_gymnasium(task: Task, act: Act, num_episodes: int, seed: int = 0) -
     """
     if not task.is_in_gymnasium:
         return score_in_sim(task, compile_episodes(task, lambda obs, key: act(obs)), num_episodes, seed)
-    warn_of_changed_sources(task.model_file, task.model_sources)
     seeds = [int(seed) + i for i in range(num_episodes)]  # Gymnasium refuses NumPy's integers
-    rounds = [seeds[i : i + _MAX_PARALLEL_EPISODES] for i in range(0, num_episodes, _MAX_PARALLEL_EPISODES)]
-    with contextlib.closing(ScoringProgress(num_episodes, len(rounds) * task.max_episode_steps)) as progress:
-        played = [_play_in_gymnasium(task, act, some, progress, number) for number, some in enumerate(rounds)]
+    returns, lengths = play_in_gymnasium(task, act, seeds)
+    return Scores(returns, lengths, seeds, task.gymnasium_id)
+
+
+def play_in_gymnasium(
+    task: Task, act: Act, seeds: list[int], changes: list[Perturbation] | None = None
+) -> tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"]]:
+    """Play one episode per seed; their returns and lengths.
+
+    Args:
+        task: an environment with an equivalent in Gymnasium, and its keywords.
+        act: as for `score_in_gymnasium`.
+        seeds: of the resets, N.
+        changes: changed physics of each episode, N; by default none.
+
+    Raises:
+        UserError: the model file is gone.
+    """
+    warn_of_changed_sources(task.model_file, task.model_sources)
+    episodes = list(zip(seeds, changes or [Perturbation()] * len(seeds), strict=True))
+    rounds = [episodes[i : i + _MAX_PARALLEL_EPISODES] for i in range(0, len(episodes), _MAX_PARALLEL_EPISODES)]
+    with contextlib.closing(ScoringProgress(len(episodes), len(rounds) * task.max_episode_steps)) as progress:
+        played = [_play_round(task, act, some, progress, number) for number, some in enumerate(rounds)]
     returns, lengths = zip(*played, strict=True)
-    return Scores(np.concatenate(returns), np.concatenate(lengths), seeds, task.gymnasium_id)
+    return np.concatenate(returns), np.concatenate(lengths)
 
 
-def _play_in_gymnasium(
-    task: Task, act: Act, seeds: list[int], progress: ScoringProgress, rounds_before: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Play one episode per seed, all in parallel; their returns and lengths."""
+def _play_round(
+    task: Task, act: Act, episodes: list[tuple[int, Perturbation]], progress: ScoringProgress, rounds_before: int
+) -> tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"]]:
+    """Play episodes in parallel, each with its seed and its changes; their returns and lengths."""
     steps_before = rounds_before * task.max_episode_steps
     keywords = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
-    returns, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), np.int64)
-    is_over = np.zeros(len(seeds), bool)
-    shares = [share for share in np.array_split(np.arange(len(seeds)), os.cpu_count() or 1) if share.size]
+    returns, lengths = np.zeros(len(episodes)), np.zeros(len(episodes), np.int64)
+    is_over = np.zeros(len(episodes), bool)
+    shares = [share for share in np.array_split(np.arange(len(episodes)), os.cpu_count() or 1) if share.size]
     with contextlib.ExitStack() as stack:
         # `multiprocessing` would import the user's main module a second time.
         workers = [
             stack.enter_context(start_module("evaluation.gymnasium_worker", stdin=PIPE, stdout=PIPE)) for _ in shares
         ]
         for worker, share in zip(workers, shares, strict=True):
-            _send(worker, (task.gymnasium_id, keywords, [seeds[i] for i in share]))
+            _send(
+                worker,
+                (task.gymnasium_id, keywords, [(seed, tuple(change)) for seed, change in (episodes[i] for i in share)]),
+            )
         obs = np.concatenate([_receive(worker) for worker in workers])
         while not is_over.all():
             actions = np.asarray(act(obs.astype(np.float32)))

@@ -1,8 +1,9 @@
 """A child process that steps real Gymnasium environments; threads would block each other on Python's lock.
 
-It exchanges pickles with its parent over pipes. It first reads `(env id, keywords, seeds)` and answers with the reset
-observations. Then it reads actions, and answers with observations, rewards and which episodes are over, until the
-input ends. Environments whose episode is over are not stepped.
+It exchanges pickles with its parent over pipes. It first reads `(env id, keywords, [(seed, changes)])`, where the
+changes are the fields of a `Perturbation`, and answers with the reset observations. Then it reads actions, and answers
+with observations, rewards and which episodes are over, until the input ends. Environments whose episode is over are not
+stepped.
 """
 
 import os
@@ -33,14 +34,17 @@ def serve() -> None:
     warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
     import gymnasium
 
+    from mjx_walk.evaluation.perturbations import Perturbation, perturb
     from mjx_walk.machine.quiet_mujoco import hide_deprecations, write_no_log
 
     write_no_log()
     gymnasium.logger.min_level = gymnasium.logger.ERROR
-    name, keywords, seeds = pickle.load(sys.stdin.buffer)
+    name, keywords, episodes = pickle.load(sys.stdin.buffer)
     with hide_deprecations():
-        envs = [gymnasium.make(name, **keywords) for _ in seeds]
-    obs = np.stack([env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)])
+        envs = [gymnasium.make(name, **keywords) for _ in episodes]
+    for env, (seed, changes) in zip(envs, episodes, strict=True):
+        perturb(env.unwrapped, Perturbation(*changes), seed)
+    obs = np.stack([env.reset(seed=seed)[0] for env, (seed, _) in zip(envs, episodes, strict=True)])
     is_over = np.zeros(len(envs), bool)
     send(answers, obs)
     while True:

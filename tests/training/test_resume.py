@@ -290,7 +290,7 @@ def test_a_gymnasium_process_whose_parent_is_gone_ends_quietly():
     worker = start_module(
         "evaluation.gymnasium_worker", stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
-    pickle.dump(("Walker2d-v5", {}, [0]), worker.stdin)
+    pickle.dump(("Walker2d-v5", {}, [(0, ())]), worker.stdin)
     worker.stdin.flush()
     assert pickle.load(worker.stdout).shape == (1, 17)
     worker.stdout.close()
