@@ -1,9 +1,13 @@
 """`python -m mjx_walk.export run=RUN_DIR`: export a policy to a file that runs without JAX and this package."""
 
 import dataclasses
+import json
+from pathlib import Path
 
-from mjx_walk import zoo
-from mjx_walk.api import load_run
+import mujoco
+
+from mjx_walk import __version__, zoo
+from mjx_walk.api import Run, load_run
 from mjx_walk.cli import parsing
 from mjx_walk.evaluation.saved_policies import kept_policies
 from mjx_walk.settings.own_tasks import take_task
@@ -23,7 +27,7 @@ usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [forma
   policy=final    the newest policy, which eval scores by default
   out=FILE.onnx   by default RUN_DIR/policy.onnx, or NAME.onnx in the current folder for a policy of the zoo. The model
                   maps `observation`, [N, observation_size], to `action`, [N, action_size] f32, both in Gymnasium's
-                  units. It normalizes observations itself.
+                  units. It normalizes observations itself. Its metadata name the task, the policy and the motors.
   dtype=float64   of `observation`: Gymnasium's observations are float64
   env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
 """
@@ -55,12 +59,40 @@ def main(command_line: list[str]) -> None:
     run = load_run(folder.path, "c", arguments.policy or BEST)
     name = f"{run.config.env.name}_{run.config.algo.name}"
     model = translate(run.act, run.task.observation_size, name, arguments.dtype)
+    onnx.helper.set_model_props(model, _metadata(run))
     with replacing(path) as new:
         onnx.save(model, str(new))
     print(f"{path}: observation [N, {run.task.observation_size}] → action [N, {run.task.action_size}]")
     print(f"It holds the {run.policy_name} policy (step {run.policy_metadata['env_steps']:,}).")
     if arguments.policy is None and len(kept_policies(folder)) > 1:
         print(choice_line(run.policy_name))
+
+
+def _metadata(run: Run) -> dict[str, str]:
+    """What a program needs to use the policy, as text; lists and numbers are JSON."""
+    task, model = run.task, run.task.model
+    keywords = task.gymnasium_kwargs()
+    if "xml_file" in keywords:  # the folder may name the user
+        keywords["xml_file"] = Path(str(keywords["xml_file"])).name
+    facts = {
+        "keywords": keywords,
+        "max_episode_steps": task.max_episode_steps,
+        "seconds_per_step": task.dt,
+        "motors": [_motor_name(model, i) for i in range(model.nu)],
+        "action_low": task.action_low.tolist(),
+        "action_high": task.action_high.tolist(),
+        "observation": task.observation_blocks(),
+        "env_steps": run.policy_metadata["env_steps"],
+    }
+    names = {"task": task.gymnasium_id, "algorithm": run.config.algo.name, "policy": run.policy_name}
+    return names | {"mjx_walk": __version__} | {name: json.dumps(fact) for name, fact in facts.items()}
+
+
+def _motor_name(model: mujoco.MjModel, index: int) -> str:
+    """Name of a motor, or of the joint that it moves if it has none."""
+    name, joint = model.actuator(index).name, int(model.actuator_trnid[index, 0])
+    on_joint = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_JOINT
+    return name or (model.joint(joint).name if on_joint else "")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
 """ONNX gives the actions that JAX gives."""
 
+import json
 import re
 import subprocess
 import sys
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,6 +97,12 @@ def test_example_of_readme(tmp_path, capsys):
     assert done.returncode == 0, done.stderr
     (total,) = re.findall(r"return ([\d,]+)", done.stdout)
     assert int(total.replace(",", "")) > 11_500
+    facts = onnxruntime.InferenceSession(tmp_path / "humanoid-csac.onnx").get_modelmeta().custom_metadata_map
+    model = gymnasium.make(facts["task"], **json.loads(facts["keywords"])).unwrapped.model
+    assert json.loads(facts["motors"]) == [model.actuator(i).name for i in range(17)]
+    assert json.loads(facts["seconds_per_step"]) == pytest.approx(0.015)
+    assert sum(json.loads(facts["observation"]).values()) == 348
+    assert (facts["algorithm"], facts["policy"]) == ("csac", "best")
 
 
 def test_export_prints_a_one_line_error(tmp_path, capsys):
