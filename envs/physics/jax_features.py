@@ -109,14 +109,13 @@ def _side_sites_elsewhere(model: mujoco.MjModel) -> Mask:
 @JAX_FEATURES.entry(
     _JAX,
     "actuator",
-    "direct-current motors, PID controllers and orientation servos",
+    "direct-current motors and orientation servos",
     "use <motor>, <position> or <velocity>",
 )
 def _newer_motors(model: mujoco.MjModel) -> Mask:
-    gain, bias, dyn = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn
-    is_newer = np.isin(model.actuator_gaintype, (gain.mjGAIN_DCMOTOR, gain.mjGAIN_PID, gain.mjGAIN_SO3))
-    is_newer |= np.isin(model.actuator_biastype, (bias.mjBIAS_DCMOTOR, bias.mjBIAS_SO3))
-    return is_newer | np.isin(model.actuator_dyntype, (dyn.mjDYN_DCMOTOR, dyn.mjDYN_PID))
+    is_newer = np.isin(model.actuator_gaintype, (mujoco.mjtGain.mjGAIN_DCMOTOR, mujoco.mjtGain.mjGAIN_SO3))
+    is_newer |= np.isin(model.actuator_biastype, (mujoco.mjtBias.mjBIAS_DCMOTOR, mujoco.mjtBias.mjBIAS_SO3))
+    return is_newer | (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR)
 
 
 @JAX_FEATURES.entry(_JAX, "actuator", "actearly", "remove actearly")

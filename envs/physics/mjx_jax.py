@@ -116,19 +116,20 @@ def _runge_kutta_4(model: mjx.Model, start: mjx.Data) -> mjx.Data:
     def stage(carry, coefficients):
         data, velocity, velocity_sum, acceleration_sum, act_dot_sum = carry
         step, weight = coefficients
-        act = start.act + step * dt * data.act_dot
         qpos = jnp.where(step == 0, start.qpos, _integrate_position(model, start.qpos, step * velocity))
         velocity = start.qvel + step * data.qacc * dt
+        act = data.act if act_dot_sum is None else start.act + step * dt * data.act_dot
         data = _forward(model, data.replace(qpos=qpos, qvel=velocity, act=act))
-        sums = (velocity_sum + weight * velocity, acceleration_sum + weight * data.qacc)
-        return (data, velocity, *sums, act_dot_sum + weight * data.act_dot), None
+        act_dot_sum = None if act_dot_sum is None else act_dot_sum + weight * data.act_dot
+        return (data, velocity, velocity_sum + weight * velocity, acceleration_sum + weight * data.qacc, act_dot_sum), None
 
     zeros = jnp.zeros_like(start.qvel)
     table = (jnp.array(_RK4_STEP, dt.dtype), jnp.array(_RK4_WEIGHT, dt.dtype))
-    sums = (zeros, zeros, jnp.zeros_like(start.act))
+    sums = (zeros, zeros, jnp.zeros_like(start.act) if model.na else None)
     (data, _, velocity, acceleration, act_dot), _ = jax.lax.scan(stage, (start, zeros, *sums), table)
+    if model.na:
+        data = data.replace(act=mjx_forward._next_activation(model, data.replace(act=start.act), act_dot))
     return data.replace(
-        act=mjx_forward._next_activation(model, data.replace(act=start.act), act_dot),
         qpos=_integrate_position(model, start.qpos, velocity),
         qvel=start.qvel + dt * acceleration,
         qacc_warmstart=data.qacc,

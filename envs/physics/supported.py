@@ -91,6 +91,21 @@ def _user_dynamics(model: mujoco.MjModel) -> Mask:
     return model.actuator_dyntype == mujoco.mjtDyn.mjDYN_USER
 
 
+@FEATURES.entry(_MJX, "actuator", "PID controllers", "use <position>")
+def _pid_motors(model: mujoco.MjModel) -> Mask:
+    is_pid = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_PID
+    return is_pid | (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_PID)
+
+
+@FEATURES.entry(
+    ("warp",), "actuator", "filterexact and inductance with RK4", 'set integrator="implicitfast", or dyntype="filter"'
+)
+def _exact_filters_with_rk4(model: mujoco.MjModel) -> Mask:
+    """Motors whose activation Warp advances by another formula than MuJoCo in the stages of RK4."""
+    is_exact = np.isin(model.actuator_dyntype, (mujoco.mjtDyn.mjDYN_FILTEREXACT, mujoco.mjtDyn.mjDYN_DCMOTOR))
+    return is_exact & (model.actuator_actadr >= 0) & (model.opt.integrator == _Integrator.mjINT_RK4)
+
+
 @FEATURES.entry(EVERY_ENGINE, "actuator", "actuators with a delay", "remove nsample and delay")
 def _delayed_actuators(model: mujoco.MjModel) -> Mask:
     return any_of(model.actuator_history)

@@ -18,8 +18,9 @@ def model_file(tmp_path_factory):
     """Gymnasium's hopper whose motors follow their controls within 40 ms."""
     path = tmp_path_factory.mktemp("model") / "filtered.xml"
     text = (ASSETS / "hopper.xml").read_text()
-    assert text.count("<motor ") == 3
-    path.write_text(text.replace("<motor ", '<general dyntype="filterexact" dynprm="0.04" '))
+    motor = '<motor ctrllimited="true" ctrlrange="-1.0 1.0" gear'
+    assert text.count(motor) == 3
+    path.write_text(text.replace(motor, motor.replace("motor", 'general dyntype="filterexact" dynprm="0.04"')))
     return str(path)
 
 

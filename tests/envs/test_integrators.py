@@ -65,4 +65,5 @@ CASES = [
 @pytest.mark.parametrize("case", slow_except(["c implicit", "jax implicitfast"], CASES))
 def test_a_step_equals_mujocos(case):
     engine, integrator = case.split()
-    assert_equal_steps(feature_models.load(*FEATURES, option=f'integrator="{integrator}"'), engine)
+    features = [name for name in FEATURES if case != "warp RK4" or not name.startswith("filterexact")]  # refused
+    assert_equal_steps(feature_models.load(*features, option=f'integrator="{integrator}"'), engine)

@@ -75,9 +75,14 @@ REFUSED = {
     "dcmotor": (
         JAX,
         {"motor": '<dcmotor name="m" joint="knee" motorconst=".05" resistance="1" ctrlrange="-1 1"/>'},
-        "direct-current motors, PID controllers and orientation servos (motor 'm')",
+        "direct-current motors and orientation servos (motor 'm')",
     ),
-    "pid": (JAX, {"motor": '<pid name="m" joint="knee" kp="5" ki="1" ctrlrange="-1 1"/>'}, "(motor 'm'); use <motor>"),
+    "pid": (MJX, {"motor": '<pid name="m" joint="knee" kp="5" ki="1" ctrlrange="-1 1"/>'}, "PID controllers (motor 'm')"),
+    "filterexact_rk4": (
+        WARP,
+        {"option": 'integrator="RK4"', "motor": GENERAL.format('dyntype="filterexact" dynprm=".05"')},
+        "filterexact and inductance with RK4 (motor 'm'); set integrator=",
+    ),
     "implicitfast_in_water": (
         JAX,
         {"option": 'integrator="implicitfast" density="1000"'},
