@@ -18,6 +18,7 @@ __all__ = [
     "Carry",
     "State",
     "TrainableTask",
+    "activation",
     "check_action_shape",
     "check_state_shape",
     "is_finite",
@@ -75,6 +76,13 @@ def check_state_shape(**arrays: tuple[ArrayLike | Array | None, int]) -> None:
     for name, (array, size) in arrays.items():
         if array is not None and np.shape(array) != (size,):
             raise UserError(f"{name} has the shape {np.shape(array)}; give ({size},), and use jax.vmap for a batch")
+
+
+def activation(size: int, act: Float[Array | np.ndarray, " na"] | None = None) -> Float[Array, " na"] | None:
+    """Activations of actuators, zeros by default as after `mj_resetData`. None in a model without them, `size` zero."""
+    if not size:
+        return None
+    return jnp.zeros(size, jnp.float32) if act is None else jnp.asarray(act, jnp.float32)
 
 
 def is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[Array, ""]:

@@ -16,7 +16,7 @@ from mjx_walk.envs.motors import motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping, shaping_terms, term_names
-from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape, check_state_shape, is_finite
+from mjx_walk.envs.state import Carry, State, TrainableTask, activation, check_action_shape, check_state_shape, is_finite
 from mjx_walk.envs.task_options import TaskOptions, check_version, with_absolute_paths
 from mjx_walk.envs.user_files import load_reward_function
 from mjx_walk.envs.view import View
@@ -201,6 +201,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         qpos: Float[Array | np.ndarray, " nq"],
         qvel: Float[Array | np.ndarray, " nv"],
         warmstart: Float[Array | np.ndarray, " nv"] | None = None,
+        act: Float[Array | np.ndarray, " na"] | None = None,
     ) -> State:
         """Initial state at a given position and velocity. Source: Gymnasium's `set_state` after a reset.
 
@@ -208,15 +209,17 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
             qpos: m and rad. Quaternions are stored and observed as given, not normalized.
             qvel: m/s and rad/s.
             warmstart: initial guess of the constraint solver (`qacc_warmstart`), m/s² and rad/s². Default: zeros.
+            act: activations of actuators. Default: zeros, as after `mj_resetData`.
 
         Raises:
             UserError: another shape, or `model` has changed. A traced reset raises it while it is traced.
         """
-        check_state_shape(qpos=(qpos, self.model.nq), qvel=(qvel, self.model.nv), warmstart=(warmstart, self.model.nv))
+        nq, nv, na = self.model.nq, self.model.nv, self.model.na
+        check_state_shape(qpos=(qpos, nq), qvel=(qvel, nv), warmstart=(warmstart, nv), act=(act, na))
         self._snapshot.refuse_changes()
         qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
         warmstart = jnp.zeros_like(qvel) if warmstart is None else jnp.asarray(warmstart, jnp.float32)
-        physics = PhysicsState(qpos, qvel, warmstart)
+        physics = PhysicsState(qpos, qvel, warmstart, activation(na, act))
         derived = self.engine.forward(physics)
         return State(
             physics=physics,
@@ -256,7 +259,9 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
             RewardStep(terms, reward, state.physics, physics, obs, action, terminated, self.dt)
         )
 
-        valid = is_finite((physics.qpos, physics.qvel)) & is_finite((physics.qacc_warmstart, obs, reward), jnp.inf)
+        # Activations may be large, as the position that an integrator commands.
+        others = (physics.qacc_warmstart, obs, reward, *jax.tree.leaves(physics.act))
+        valid = is_finite((physics.qpos, physics.qvel)) & is_finite(others, jnp.inf)
         physics, carry, obs = jax.tree.map(
             lambda new, old: jnp.where(valid, new, old), (physics, carry, obs), (state.physics, state.memory, state.obs)
         )
@@ -290,7 +295,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     def _reward_term_names(self) -> tuple[str, ...]:
         """Names of all reward terms, found by tracing `reward_function` on an example step."""
         terms = dict.fromkeys(self.gymnasium_reward_terms, jnp.float32(0.0))
-        physics = PhysicsState(self.init_qpos, self.init_qvel, self.init_qvel)
+        physics = PhysicsState(self.init_qpos, self.init_qvel, self.init_qvel, activation(self.model.na))
         obs, action = jnp.zeros(self.observation_size), jnp.zeros(self.action_size)
         step = RewardStep(terms, jnp.float32(0.0), physics, physics, obs, action, jnp.zeros((), bool), self.dt)
         names, shaped = tuple(terms), shaping_terms(self.options.shaping, step, self._motor_dofs)

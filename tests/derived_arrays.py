@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from rich_model import FIXED, FORCE_SENSORS, NOT_ON_MJX, SENSORS, SPATIAL, SUBTREE_SENSORS, rich, sensors
+from rich_model import ACTIVATION, FIXED, FORCE_SENSORS, NOT_ON_MJX, SENSORS, SPATIAL, SUBTREE_SENSORS, rich, sensors
 
 from mjx_walk.envs import models
 from mjx_walk.envs.physics import PhysicsState, make_engine
@@ -36,6 +36,10 @@ MODELS: dict[str, Callable[[], mujoco.MjModel]] = {
     "air": lambda: rich(height=2),
     "floor": rich,
     "rk4": lambda: rich("RK4"),
+    "implicit": lambda: rich("implicit", motor=ACTIVATION),
+    "implicitfast": lambda: rich("implicitfast", motor=ACTIVATION),
+    "activation": lambda: rich(motor=ACTIVATION, sensor=FORCE_SENSORS),
+    "activation_rk4": lambda: rich("RK4", motor=ACTIVATION),
     "elliptic": lambda: rich(option='cone="elliptic" impratio="5"'),
     "fluid": lambda: rich(option='density="500" viscosity=".5" wind="1 0 0"'),
     "no_gravity": lambda: rich(flag='gravity="disable"'),
@@ -76,7 +80,8 @@ def reference_cases(model: mujoco.MjModel, num_cases: int = 6, every: int = 12) 
     data.qvel[:] = 0.5 * rng.normal(size=model.nv)
     cases = []
     for i in range(num_cases * every):
-        state = PhysicsState(*(np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart)))
+        act = np.float32(data.act) if model.na else None
+        state = PhysicsState(np.float32(data.qpos), np.float32(data.qvel), np.float32(data.qacc_warmstart), act)
         ctrl = np.float32(rng.uniform(-1, 1, model.nu))
         mujoco.mj_resetData(model, fresh)
         _set(fresh, state)
@@ -91,7 +96,9 @@ def reference_cases(model: mujoco.MjModel, num_cases: int = 6, every: int = 12) 
 
 
 def _set(data: mujoco.MjData, state: PhysicsState) -> None:
-    data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = state
+    data.qpos[:], data.qvel[:], data.qacc_warmstart[:], act = state
+    if act is not None:
+        data.act[:] = act
 
 
 def _copy(data: mujoco.MjData, name: str) -> Any:
@@ -114,7 +121,7 @@ def accepted(model: mujoco.MjModel, engine: str, names: list[str]) -> Iterator[s
 def errors(model: mujoco.MjModel, engine: str, names: tuple[str, ...], cases: list[Case]) -> dict[str, list[float]]:
     """Largest errors by name at both moments, relative to the array's largest value, or absolute if that is zero."""
     made = make_engine(engine, model, NUM_SUBSTEPS, names)
-    state = PhysicsState(*(jnp.asarray(np.stack(x)) for x in zip(*(case.state for case in cases), strict=True)))
+    state = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *(case.state for case in cases))
     ctrl = jnp.asarray(np.stack([case.ctrl for case in cases]))
     found = (jax.jit(jax.vmap(made.forward))(state), jax.jit(jax.vmap(made.step))(state, ctrl)[1])
     return {

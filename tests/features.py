@@ -59,6 +59,7 @@ OPTIONS = {
         "disabled_group": 'actuatorgroupdisable="0"',
         "o_solref": 'o_solref=".1 1"',
         "implicitfast": 'integrator="implicitfast"',
+        "implicit": 'integrator="implicit"',
         "discrete": 'integrator="discrete"',
     }.items()
 }
@@ -85,6 +86,14 @@ JOINTS = {
     "ball": {"world": BALL.format('damping=".1" stiffness=".3" armature=".01" frictionloss=".01"')},
     "ball_limit": {"world": BALL.format('range="0 10" limited="true" margin="3"')},
     "free": {"world": FREE.format('stiffness="3" damping=".2" armature=".05" frictionloss=".1"')},
+    "free_offset": {
+        "world": '<body name="free" pos="2 0 1"><freejoint/><geom type="capsule" size=".05" fromto="0 0 0 .3 .1 0"/>'
+        '<geom size=".1" pos="-.1 .2 .1"/></body>'
+    },
+    "free_welded": {
+        "world": '<body name="free" pos="2 0 1"><joint type="free" damping=".1"/><geom type="box" size=".2 .1 .02"/>'
+        '<body pos=".2 0 0" euler="10 20 30"><geom type="box" size=".02 .1 .2"/></body></body>'
+    },
     "freejoint": {"world": '<body name="free" pos="2 0 .1"><freejoint/><geom type="capsule" size=".05 .1"/></body>'},
 }
 BODIES = {
@@ -208,9 +217,8 @@ MOTORS = {
     "cylinder": {"actuator": '<cylinder joint="arm" ctrlrange="-1 1"/>'},
     "muscle": {"actuator": '<muscle joint="arm" ctrlrange="0 1" lengthrange="-1 1" force="10"/>'},
     "muscle_gain": {
-        "actuator": GENERAL.format(
-            f'joint="arm" lengthrange="-1 1" gaintype="muscle" biastype="muscle" gainprm="{MUSCLE}" biasprm="{MUSCLE}"'
-        )
+        "actuator": f'<general joint="arm" ctrlrange="0 1" lengthrange="-1 1" gaintype="muscle" gainprm="{MUSCLE}" '
+        f'biastype="muscle" biasprm="{MUSCLE}"/>'
     },
     "affine": {
         "actuator": GENERAL.format(
@@ -219,9 +227,54 @@ MOTORS = {
     },
     "orientation": {"world": HUNG, "actuator": '<orientation joint="ball" kp="2" kv=".1"/>'},
     "orientation_ranged": {"world": HUNG, "actuator": '<orientation joint="ball" kp="2" ctrlrange="-1 1"/>'},
+    **{
+        name: {"actuator": GENERAL.format(f'joint="arm" gainprm="3" {text}')}
+        for name, text in {
+            "integrator": 'dyntype="integrator"',
+            "integrator_actrange": 'dyntype="integrator" actrange="-.01 .01"',
+            "integrator_servo": 'dyntype="integrator" biastype="affine" biasprm="0 -3 -.2"',
+            "filter": 'dyntype="filter" dynprm=".05"',
+            "filterexact": 'dyntype="filterexact" dynprm=".05"',
+            "filterexact_fast": 'dyntype="filterexact" dynprm=".001"',
+            "filterexact_actrange": 'dyntype="filterexact" dynprm=".02" actrange="-.1 .2"',
+            "muscle_dynamics": 'dyntype="muscle" dynprm=".01 .04"',
+            "muscle_smooth": 'dyntype="muscle" dynprm=".01 .04 .3"',
+            "actearly": 'dyntype="filterexact" dynprm=".05" actearly="true"',
+            "actearly_integrator": 'dyntype="integrator" actearly="true" actrange="-.01 .01"',
+            "user_dynamics": 'dyntype="user" actdim="1"',
+        }.items()
+    },
+    "filter_affine": {
+        "actuator": GENERAL.format('joint="arm" dyntype="filter" dynprm=".05" gaintype="affine" gainprm="1 2 -.5"')
+    },
+    "two_filters": {
+        "motor": 'group="1"',
+        "actuator": GENERAL.format('joint="arm" gainprm="3" dyntype="filter" dynprm=".05"')
+        + '<motor joint="hinge" ctrlrange="-1 1"/>'
+        + GENERAL.format('joint="knee" gainprm="2" dyntype="integrator"'),
+    },
+    "servo_forcerange": {"actuator": '<position joint="arm" kp="50" kv="2" forcerange="-1 1" ctrlrange="-1 1"/>'},
+    "servo_inheritrange": {
+        "arm_joint": 'range="-40 40"',
+        "actuator": '<position joint="arm" kp="5" dampratio=".7" inheritrange="1"/>',
+    },
+    "servo_frcrange": {
+        "arm_joint": 'actuatorfrcrange="-.5 .5"',
+        "actuator": '<position joint="arm" kp="50" kv="2" ctrlrange="-1 1"/>',
+    },
+    "tendon_servo": {
+        "tendon": ACROSS.format(""), "actuator": '<position tendon="across" kp="5" kv="3" ctrlrange="0 1"/>'
+    },
+    "tendon_servo_range": {
+        "tendon": FIXED.format('actuatorfrcrange="-.2 .2"'),
+        "actuator": '<position tendon="fixed" kp="9" kv="3" ctrlrange="-1 1"/>',
+    },
     "pid": {"actuator": '<pid joint="arm" kp="5" ki="1" kv="1" ctrlrange="-1 1"/>'},
     "pid_without_i": {"actuator": '<pid joint="arm" kp="5" kv="1" ctrlrange="-1 1"/>'},
     "dcmotor": {"actuator": '<dcmotor joint="arm" motorconst=".05" resistance="1" ctrlrange="-1 1"/>'},
+    "dcmotor_inductance": {
+        "actuator": '<dcmotor joint="arm" motorconst=".5" resistance="1" inductance=".01" ctrlrange="-1 1"/>'
+    },
     "motor_armature": {"motor": 'armature=".2"'},
     "motor_damping": {"motor": 'damping=".2"'},
     "motor_dampingpoly": {"motor": 'damping=".2 .1 .1"'},

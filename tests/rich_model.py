@@ -58,6 +58,10 @@ FIXED = """<fixed name="t" stiffness="1" damping=".2" range="-.1 .1" limited="tr
 SPATIAL = """<spatial name="s" stiffness="10" damping="1" springlength=".1 .2">
   <site site="back"/><geom geom="pulley"/><site site="tip"/></spatial>
 <spatial range="0 .5" limited="true" frictionloss=".1" armature=".3"><site site="hand"/><site site="back"/></spatial>"""
+ACTIVATION = """<general joint="arm" dyntype="filterexact" dynprm=".05" gainprm="2" ctrlrange="-1 1"/>
+<general joint="knee" dyntype="integrator" gainprm="3" actrange="-.1 .1" ctrlrange="-1 1"/>
+<muscle joint="arm" lengthrange="-1 1" force="5" ctrlrange="0 1"/>"""
+"""Actuators with an activation."""
 FORCE_SENSORS = '<accelerometer site="tip"/><force site="tip"/><torque site="hand"/><touch site="end"/>'
 SENSORS = {
     **{kind: f'<{kind} site="tip"/>' for kind in ("accelerometer", "velocimeter", "gyro", "force", "magnetometer")},

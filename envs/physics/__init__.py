@@ -73,12 +73,6 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
     Raises:
         UserError: the engine does not simulate something that the model has, or does not return a derived array.
     """
-    integrator = mujoco.mjtIntegrator(model.opt.integrator)
-    if integrator not in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4):
-        given = integrator.name.removeprefix("mjINT_").lower()
-        raise UserError(
-            f"the model's integrator '{given}' is not supported; set integrator to Euler or RK4 in <option>"
-        )
     refuse_unsupported(model, name)
     refuse_derived(model, name, derived)
     if name == "c":

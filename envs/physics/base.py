@@ -19,7 +19,10 @@ Derived = dict[str, Array]
 
 
 class PhysicsState(NamedTuple):
-    """The complete state of a MuJoCo simulation: position, velocity and initial guess of the constraint solver."""
+    """The complete state of a MuJoCo simulation.
+
+    It is position, velocity, initial guess of the constraint solver, and activations of actuators.
+    """
 
     qpos: Array
     """`[nq] f32`, m and rad. Quaternions need not be normalized."""
@@ -27,6 +30,8 @@ class PhysicsState(NamedTuple):
     """`[nv] f32`, m/s and rad/s."""
     qacc_warmstart: Array
     """`[nv] f32`, m/s² and rad/s²."""
+    act: Array | None = None
+    """`[na] f32`, activations of actuators. None in a model without them, so that such states keep their leaves."""
 
 
 class Engine(Protocol):

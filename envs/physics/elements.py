@@ -8,7 +8,7 @@ from jaxtyping import Int, Shaped
 
 from mjx_walk.envs.physics.feature_table import Mask
 
-__all__ = ["constraint_settings", "moving_bodies", "pairs_that_move"]
+__all__ = ["constraint_settings", "contact_friction", "moving_bodies", "names_of_pair", "pairs_that_move"]
 
 
 def pairs_that_move(model: mujoco.MjModel) -> tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, " n"]]:
@@ -19,6 +19,24 @@ def pairs_that_move(model: mujoco.MjModel) -> tuple[Int[np.ndarray, "n 2"], Int[
     is_off = model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     pairs = np.array([] if is_off else [*moving_pairs(model)], int).reshape(-1, 3)
     return pairs[:, :2], pairs[:, 2]
+
+
+def contact_friction(
+    model: mujoco.MjModel, geoms: Int[np.ndarray, "n 2"], pairs: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " n"], Shaped[np.ndarray, " n"]]:
+    """Dimension and sliding friction of the contacts of pairs of geoms, as C combines them."""
+    priority = model.geom_priority[geoms]
+    is_used = priority == priority.max(axis=1, keepdims=True)
+    condim = np.where(is_used, model.geom_condim[geoms], 0).max(axis=1)
+    friction = np.where(is_used, model.geom_friction[geoms, 0], 0.0).max(axis=1)
+    is_own = pairs >= 0
+    condim[is_own], friction[is_own] = model.pair_dim[pairs[is_own]], model.pair_friction[pairs[is_own], 0]
+    return condim, friction
+
+
+def names_of_pair(model: mujoco.MjModel, geoms: Int[np.ndarray, " 2"]) -> str:
+    """Two geoms by their names or indices."""
+    return "geoms " + " and ".join(f"'{model.geom(int(geom)).name or geom}'" for geom in geoms)
 
 
 def moving_bodies(model: mujoco.MjModel) -> Mask:

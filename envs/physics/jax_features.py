@@ -7,7 +7,13 @@ import mujoco
 import numpy as np
 from jaxtyping import Shaped
 
-from mjx_walk.envs.physics.elements import constraint_settings, moving_bodies, pairs_that_move
+from mjx_walk.envs.physics.elements import (
+    constraint_settings,
+    contact_friction,
+    moving_bodies,
+    names_of_pair,
+    pairs_that_move,
+)
 from mjx_walk.envs.physics.feature_table import FeatureTable, Mask, any_of, name_of
 
 __all__ = ["JAX_FEATURES"]
@@ -40,6 +46,47 @@ def _turning_bodies(model: mujoco.MjModel) -> Mask:
     return moving_bodies(model) & (turning * reach**2 > _MOST_TURNING * centre)
 
 
+@JAX_FEATURES.entry(
+    _JAX,
+    None,
+    "contacts of these types of geoms",
+    "use capsules or boxes instead, or exclude them with contype and conaffinity",
+)
+def _other_collisions(model: mujoco.MjModel) -> Iterator[str]:
+    """Pairs of geoms without a collision function in MJX: cylinders or ellipsoids with boxes or meshes, for example."""
+    from mjx_walk.machine import quiet_mjx  # noqa: F401  # isort: skip
+    from mujoco.mjx._src.collision_driver import has_collision_fn
+
+    for both in pairs_that_move(model)[0]:
+        kinds = model.geom_type[both]
+        if not has_collision_fn(*kinds):
+            names = " and ".join(mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower() for kind in kinds)
+            yield f"{names}, {names_of_pair(model, both)}"
+
+
+@JAX_FEATURES.entry(_JAX, None, "a margin of meshes and height fields", "remove margin from both geoms")
+def _mesh_margins(model: mujoco.MjModel) -> Iterator[str]:
+    """Contacts with a margin of which one geom is a mesh or a height field."""
+    geoms, pairs = pairs_that_move(model)
+    is_mesh = np.isin(model.geom_type[geoms], (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)).any(axis=1)
+    margin = model.geom_margin[geoms].sum(axis=1)
+    margin[pairs >= 0] = model.pair_margin[pairs[pairs >= 0]]
+    for both in geoms[is_mesh & (margin != 0)]:
+        yield names_of_pair(model, both)
+
+
+@JAX_FEATURES.entry(
+    _JAX, None, "elliptic contacts without friction", 'set condim="3", or cone="pyramidal" in <option>'
+)
+def _elliptic_without_friction(model: mujoco.MjModel) -> Iterator[str]:
+    """Contacts of dimension one in a model with elliptic cones."""
+    if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
+        return
+    geoms, pairs = pairs_that_move(model)
+    for both in geoms[contact_friction(model, geoms, pairs)[0] == 1]:
+        yield names_of_pair(model, both)
+
+
 @JAX_FEATURES.entry(_JAX, None, "a solimp of width zero as MuJoCo does", "set its third number to more than zero")
 def _solimps_without_width(model: mujoco.MjModel) -> Iterator[str]:
     """Elements with a `solimp` of width zero, where MuJoCo takes the mean of `dmin` and `dmax`."""
@@ -57,6 +104,33 @@ def _side_sites_elsewhere(model: mujoco.MjModel) -> Mask:
     elsewhere = wraps[model.site_bodyid[sites] != model.geom_bodyid[geoms]]
     ends = zip(model.tendon_adr, model.tendon_num, strict=True)
     return np.array([np.any((elsewhere >= first) & (elsewhere < first + num)) for first, num in ends], bool)
+
+
+@JAX_FEATURES.entry(
+    _JAX,
+    "actuator",
+    "direct-current motors and orientation servos",
+    "use <motor>, <position> or <velocity>",
+)
+def _newer_motors(model: mujoco.MjModel) -> Mask:
+    is_newer = np.isin(model.actuator_gaintype, (mujoco.mjtGain.mjGAIN_DCMOTOR, mujoco.mjtGain.mjGAIN_SO3))
+    is_newer |= np.isin(model.actuator_biastype, (mujoco.mjtBias.mjBIAS_DCMOTOR, mujoco.mjtBias.mjBIAS_SO3))
+    return is_newer | (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR)
+
+
+@JAX_FEATURES.entry(_JAX, "actuator", "actearly", "remove actearly")
+def _early_motors(model: mujoco.MjModel) -> Mask:
+    """Motors whose force follows the activation of the next substep. MJX takes the present one."""
+    return model.actuator_actearly.astype(bool) & (model.actuator_actadr >= 0)
+
+
+@JAX_FEATURES.entry(
+    _JAX, None, "implicitfast in a medium", 'set density and viscosity to 0, or integrator="Euler", in <option>'
+)
+def _implicit_fluid(model: mujoco.MjModel) -> list[str]:
+    """A medium with the implicit integrator. MJX has no derivatives of its forces."""
+    is_implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return [name for name in ("density", "viscosity") if is_implicit and getattr(model.opt, name) > 0]
 
 
 @JAX_FEATURES.entry(_JAX, "actuator", "actuator damping", "set damping on the joint")

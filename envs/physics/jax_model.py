@@ -12,6 +12,8 @@ def adapt_model(model: mujoco.MjModel) -> None:
     """Change a copy of a model for MJX's JAX implementation."""
     _apply_spring_and_damper_flags(model)
     _raise_friction(model)
+    if not (model.opt.density > 0 or model.opt.viscosity > 0):
+        model.opt.wind[:] = 0  # no effect in C; MJX refuses it with an implicit integrator
 
 
 def _apply_spring_and_damper_flags(model: mujoco.MjModel) -> None:

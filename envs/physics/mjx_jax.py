@@ -14,11 +14,11 @@ from mujoco.mjx._src import scan as mjx_scan
 from mujoco.mjx._src import sensor as mjx_sensor
 from mujoco.mjx._src import smooth as mjx_smooth
 
-from mjx_walk.envs.physics import capsule_frames_jax, static_pairs
+from mjx_walk.envs.physics import capsule_frames_jax, implicit_jax, static_pairs
 from mjx_walk.envs.physics.base import Derived, PhysicsState
 from mjx_walk.envs.physics.derived_arrays import LATE_ARRAYS, derived_shapes
 from mjx_walk.envs.physics.jax_model import adapt_model
-from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
+from mjx_walk.envs.physics.mjx_model import read_derived, state_of, with_newton_solver, with_state
 from mjx_walk.envs.physics.preparation import Preparation
 
 __all__ = ["JaxEngine"]
@@ -40,7 +40,7 @@ class JaxEngine:
         adapt_model(model)
         self._model = self._own_model = mjx.put_model(model, impl="jax")
         self._blank = mjx.make_data(model, impl="jax")
-        self._substep = _runge_kutta_4 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else _euler
+        self._substep = _SUBSTEPS[mujoco.mjtIntegrator(model.opt.integrator)]
         self._num_substeps = num_substeps
         self.preparation = Preparation()
         self._derived = derived_shapes(model, derived)
@@ -57,7 +57,7 @@ class JaxEngine:
         self._model = own.tree_replace(changes) if changes else own
 
     def _data(self, state: PhysicsState) -> mjx.Data:
-        return self._blank.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
+        return with_state(self._blank, state)
 
     def forward(self, state: PhysicsState) -> Derived:
         """See `Engine.forward`."""
@@ -72,8 +72,7 @@ class JaxEngine:
             data, _ = jax.lax.scan(lambda d, _: (self._substep(self._model, d), None), data, length=self._num_substeps)
             if self._derived.keys() & LATE_ARRAYS:
                 data = mjx_smooth.rne_postconstraint(self._model, data)
-        state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-        return state, read_derived(data, self._derived), jnp.zeros((), bool)
+        return state_of(data), read_derived(data, self._derived), jnp.zeros((), bool)
 
 
 def _forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -93,10 +92,18 @@ def _euler(model: mjx.Model, start: mjx.Data) -> mjx.Data:
     XLA's threads while it occupies one of them. On a CPU with two threads, two at the same time would wait for each
     other forever. The added zero makes the second one wait for the accelerations, which need the first.
     """
-    data = _forward(model, start)
-    if model.nv:
-        data = data.tree_replace({"_impl.M": data._impl.M + 0.0 * data.qacc[0]})
-    return mjx_forward.euler(model, data)
+    return mjx_forward.euler(model, _factorized_later(model, _forward(model, start)))
+
+
+def _implicitfast(model: mjx.Model, start: mjx.Data) -> mjx.Data:
+    """Advance by one substep with MuJoCo's `implicitfast`. It factorizes twice, as `_euler` does."""
+    data = _factorized_later(model, _forward(model, start))
+    return mjx_forward._advance(model, data, data.act_dot, implicit_jax.acceleration(model, data))
+
+
+def _factorized_later(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Data whose mass matrix is known only after the accelerations are."""
+    return data.tree_replace({"_impl.M": data._impl.M + 0.0 * data.qacc[0]}) if model.nv else data
 
 
 def _runge_kutta_4(model: mjx.Model, start: mjx.Data) -> mjx.Data:
@@ -107,16 +114,21 @@ def _runge_kutta_4(model: mjx.Model, start: mjx.Data) -> mjx.Data:
     dt = model.opt.timestep
 
     def stage(carry, coefficients):
-        data, velocity, velocity_sum, acceleration_sum = carry
+        data, velocity, velocity_sum, acceleration_sum, act_dot_sum = carry
         step, weight = coefficients
         qpos = jnp.where(step == 0, start.qpos, _integrate_position(model, start.qpos, step * velocity))
         velocity = start.qvel + step * data.qacc * dt
-        data = _forward(model, data.replace(qpos=qpos, qvel=velocity))
-        return (data, velocity, velocity_sum + weight * velocity, acceleration_sum + weight * data.qacc), None
+        act = data.act if act_dot_sum is None else start.act + step * dt * data.act_dot
+        data = _forward(model, data.replace(qpos=qpos, qvel=velocity, act=act))
+        act_dot_sum = None if act_dot_sum is None else act_dot_sum + weight * data.act_dot
+        return (data, velocity, velocity_sum + weight * velocity, acceleration_sum + weight * data.qacc, act_dot_sum), None
 
     zeros = jnp.zeros_like(start.qvel)
     table = (jnp.array(_RK4_STEP, dt.dtype), jnp.array(_RK4_WEIGHT, dt.dtype))
-    (data, _, velocity, acceleration), _ = jax.lax.scan(stage, (start, zeros, zeros, zeros), table)
+    sums = (zeros, zeros, jnp.zeros_like(start.act) if model.na else None)
+    (data, _, velocity, acceleration, act_dot), _ = jax.lax.scan(stage, (start, zeros, *sums), table)
+    if model.na:
+        data = data.replace(act=mjx_forward._next_activation(model, data.replace(act=start.act), act_dot))
     return data.replace(
         qpos=_integrate_position(model, start.qpos, velocity),
         qvel=start.qvel + dt * acceleration,
@@ -131,3 +143,11 @@ def _integrate_position(
     """Position after one substep at a constant velocity. Source: MuJoCo's `mj_integratePos`."""
     integrate = functools.partial(mjx_forward._integrate_pos, dt=model.opt.timestep)
     return mjx_scan.flat(model, integrate, "jqv", "q", model.jnt_type, qpos, velocity)
+
+
+_SUBSTEPS = {
+    mujoco.mjtIntegrator.mjINT_EULER: _euler,
+    mujoco.mjtIntegrator.mjINT_RK4: _runge_kutta_4,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: _implicitfast,
+}
+"""Function of a substep by the model's integrator."""

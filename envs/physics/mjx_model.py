@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from mjx_walk.envs.physics.base import Derived
+from mjx_walk.envs.physics.base import Derived, PhysicsState
 
-__all__ = ["MIN_SOLVER_ITERATIONS", "read_derived", "with_newton_solver"]
+__all__ = ["MIN_SOLVER_ITERATIONS", "read_derived", "state_of", "with_newton_solver", "with_state"]
 
 MIN_SOLVER_ITERATIONS = 8
 """Newton iterations and line-search steps. In float32, 8 give the same result as 50; 4 do only with few contacts."""
@@ -32,6 +32,17 @@ def with_newton_solver(model: mujoco.MjModel) -> mujoco.MjModel:
         if limit >= 0:
             model.numeric_data[limit] = -1
     return model
+
+
+def with_state(data: mjx.Data, state: PhysicsState) -> mjx.Data:
+    """MJX's data with another physics state. Both have the same names."""
+    return data.replace(**{name: array for name, array in state._asdict().items() if array is not None})
+
+
+def state_of(data: mjx.Data) -> PhysicsState:
+    """The physics state that MJX's data hold, with or without a batch axis."""
+    act = data.act if data.act.shape[-1] else None
+    return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, act)
 
 
 def read_derived(data: mjx.Data, shapes: dict[str, tuple[int, ...]], batch: tuple[int, ...] = ()) -> Derived:

@@ -16,7 +16,7 @@ from mujoco import mjx
 from mjx_walk.envs.physics import body_forces, capsule_frames_warp
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.derived_arrays import LATE_ARRAYS, derived_shapes, fills_late_arrays
-from mjx_walk.envs.physics.mjx_model import read_derived, with_newton_solver
+from mjx_walk.envs.physics.mjx_model import read_derived, state_of, with_newton_solver, with_state
 from mjx_walk.envs.physics.preparation import Preparation
 from mjx_walk.envs.physics.static_pairs import drop_static_pairs
 from mjx_walk.envs.physics.warp_kernels import choose_cache, load_kernels
@@ -92,7 +92,7 @@ class WarpEngine:
             )
             blank = jax.tree.map(np.asarray, blank)
         blank = jax.tree.map(lambda x: jnp.array(x) if x.any() else jnp.zeros(x.shape, x.dtype), blank)
-        return jax.vmap(lambda s: blank.replace(qpos=s.qpos, qvel=s.qvel, qacc_warmstart=s.qacc_warmstart))(state)
+        return jax.vmap(functools.partial(with_state, blank))(state)
 
     def _forward(self, state: PhysicsState) -> Derived:
         data = self._mjx_forward(self._data(state)).replace(qpos=state.qpos)  # MJX normalizes its quaternions
@@ -103,7 +103,7 @@ class WarpEngine:
         return derived | {name: jnp.zeros_like(derived[name]) for name in self._body_forces}
 
     def _step(self, state: PhysicsState, ctrl: Float[Array, "B nu"]) -> tuple[PhysicsState, Derived, Bool[Array, " B"]]:
-        data = self._data(state).replace(ctrl=ctrl)
+        data = self._data(state).replace(ctrl=self._used_control(ctrl))
         overflow = lost_rows = jnp.zeros(ctrl.shape[0], bool)
         for substep in range(self._num_substeps):
             is_last = substep == self._num_substeps - 1
@@ -113,10 +113,19 @@ class WarpEngine:
             num_needed = jnp.maximum(data._impl.nacon, data._impl.ncollision)
             overflow |= (num_needed > data._impl.naconmax).any()
             lost_rows |= data._impl.nefc > data._impl.njmax
+        data = data.replace(ctrl=ctrl)
         # Velocities diverge once constraint rows are lost, so the task must end these episodes as not finite.
-        qpos = jnp.where(lost_rows[:, None], jnp.nan, data.qpos)
-        state = PhysicsState(qpos, data.qvel, data.qacc_warmstart)
+        state = state_of(data)
+        state = state._replace(qpos=jnp.where(lost_rows[:, None], jnp.nan, state.qpos))
         return state, self._read_after_step(data), overflow | lost_rows
+
+    def _used_control(self, ctrl: Float[Array, "B nu"]) -> Float[Array, "B nu"]:
+        """The control, clipped for an implicit integrator. Warp clips it in forces, but not in their derivatives."""
+        model = self._mj_model
+        is_explicit = model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        if is_explicit or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
+            return ctrl
+        return jnp.where(model.actuator_ctrllimited.astype(bool), jnp.clip(ctrl, *model.actuator_ctrlrange.T), ctrl)
 
     def _read_after_step(self, data: mjx.Data) -> Derived:
         derived = read_derived(data, self._derived, data.qvel.shape[:1])

@@ -39,6 +39,7 @@ class CEngine:
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
         self._model = copy.copy(model)  # the MJX engines do not see later changes either
         self._num_substeps = num_substeps
+        self._state_names = PhysicsState._fields if model.na else PhysicsState._fields[:3]
         self.preparation = Preparation()
         self._derived_shapes = derived_shapes(model, derived)
         self._num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -50,18 +51,18 @@ class CEngine:
 
     def _forward(self, state: PhysicsState) -> Derived:
         _, derived, _ = self._result_shapes(len(state.qpos))
-        return jax.pure_callback(self._host_forward, derived, *state)
+        return jax.pure_callback(self._host_forward, derived, *jax.tree.leaves(state))
 
     def _step(self, state: PhysicsState, ctrl: Float[Array, "B nu"]) -> tuple[PhysicsState, Derived, Bool[Array, " B"]]:
         shapes = self._result_shapes(len(ctrl))
-        next_state, derived, overflow = jax.pure_callback(self._host_step, shapes, *state, ctrl)
+        next_state, derived, overflow = jax.pure_callback(self._host_step, shapes, *jax.tree.leaves(state), ctrl)
         return PhysicsState(*next_state), derived, overflow
 
     def _result_shapes(self, num_envs: int) -> tuple[tuple[_Shape, ...], dict[str, _Shape], _Shape]:
         """Shapes of what `_step` returns."""
         float32 = functools.partial(jax.ShapeDtypeStruct, dtype=np.float32)
-        nq, nv = self._model.nq, self._model.nv
-        state = (float32((num_envs, nq)), float32((num_envs, nv)), float32((num_envs, nv)))
+        sizes = [np.size(getattr(self._workspaces[0], name)) for name in self._state_names]
+        state = tuple(float32((num_envs, size)) for size in sizes)
         derived = {name: float32((num_envs, *shape)) for name, shape in self._derived_shapes.items()}
         return state, derived, jax.ShapeDtypeStruct((num_envs,), np.bool_)
 
@@ -75,7 +76,7 @@ class CEngine:
         self, state: list[np.ndarray], derived: dict[str, np.ndarray], data: mujoco.MjData, i: int
     ) -> None:
         mujoco.mj_resetData(self._model, data)  # clears cfrc_ext, which mj_forward does not compute
-        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = (x[i] for x in state)
+        self._load_state(state, data, i)
         mujoco.mj_forward(self._model, data)
         self._store_derived(derived, data, i)
 
@@ -95,18 +96,23 @@ class CEngine:
         data: mujoco.MjData,
         i: int,
     ) -> None:
-        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = (x[i] for x in state)
+        self._load_state(state, data, i)
         data.ctrl[:] = ctrl[i]
         mujoco.mj_step(self._model, data, nstep=self._num_substeps)
         mujoco.mj_rnePostConstraint(self._model, data)
-        for target, source in zip(next_state, (data.qpos, data.qvel, data.qacc_warmstart), strict=True):
-            target[i] = source
+        for name, target in zip(self._state_names, next_state, strict=True):
+            target[i] = getattr(data, name)
         self._store_derived(derived, data, i)
         if data.warning.number[_BAD_STATE].any():
             # MuJoCo has detected an invalid state and has reset itself. The MJX engines return NaN instead.
             for target in next_state:
                 target[i] = np.nan
             mujoco.mj_resetData(self._model, data)
+
+    def _load_state(self, state: list[np.ndarray], data: mujoco.MjData, i: int) -> None:
+        """Copy the state of environment i to `data`."""
+        for name, source in zip(self._state_names, state, strict=True):
+            getattr(data, name)[:] = source[i]
 
     def _empty_derived(self, num_envs: int) -> dict[str, np.ndarray]:
         return {name: np.empty((num_envs, *shape), np.float32) for name, shape in self._derived_shapes.items()}

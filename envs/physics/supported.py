@@ -1,17 +1,23 @@
 """Elements that an engine does not simulate. A model with one is refused before compilation, by the element's name.
 
-MuJoCo's complete state is `mjSTATE_INTEGRATION`. `PhysicsState` carries position, velocity and the solver's initial
-guess. Mocap bodies and equality flags never change during an episode, so they need not be carried. The rest is refused
-on every engine. MJX silently ignores further features; those are refused on its engines.
+MuJoCo's complete state is `mjSTATE_INTEGRATION`. `PhysicsState` carries position, velocity, the solver's initial guess
+and activations. Mocap bodies and equality flags never change during an episode, so they need not be carried. The rest is
+refused on every engine. MJX silently ignores further features; those are refused on its engines.
 """
 
 from collections.abc import Iterator
 
 import mujoco
 import numpy as np
-from jaxtyping import Int, Shaped
+from jaxtyping import Shaped
 
-from mjx_walk.envs.physics.elements import constraint_settings, moving_bodies, pairs_that_move
+from mjx_walk.envs.physics.elements import (
+    constraint_settings,
+    contact_friction,
+    moving_bodies,
+    names_of_pair,
+    pairs_that_move,
+)
 from mjx_walk.envs.physics.feature_table import EVERY_ENGINE, FeatureTable, Mask, any_of, name_of
 from mjx_walk.envs.physics.jax_features import JAX_FEATURES
 from mjx_walk.utils.errors import UserError, first_line
@@ -23,6 +29,10 @@ FEATURES = FeatureTable()
 
 _MJX = ("warp", "jax")
 _Flag = mujoco.mjtDisableBit
+_Integrator = mujoco.mjtIntegrator
+_INTEGRATORS = (
+    *(_Integrator.mjINT_EULER, _Integrator.mjINT_RK4, _Integrator.mjINT_IMPLICITFAST, _Integrator.mjINT_IMPLICIT),
+)
 _LEAST_PYRAMIDAL_FRICTION = 0.05
 """With it, velocities after a step differ from C's by at most 1.1e-3, relative to one plus their change."""
 
@@ -58,13 +68,42 @@ def unsupported_by_mjx(engine: str, error: Exception) -> UserError:
 
 
 @FEATURES.entry(
-    EVERY_ENGINE,
-    "actuator",
-    "actuators with an activation state",
-    'set dyntype="none", or use <motor>, <position> or <velocity> without a time constant',
+    EVERY_ENGINE, None, "this integrator", "set integrator to Euler, RK4, implicitfast or implicit in <option>"
 )
-def _actuators_with_activation(model: mujoco.MjModel) -> Mask:
-    return model.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE
+def _other_integrators(model: mujoco.MjModel) -> Iterator[str]:
+    yield from _integrator_if(model, model.opt.integrator not in _INTEGRATORS)
+
+
+@FEATURES.entry(_MJX, None, "this integrator", "set integrator to implicitfast, Euler or RK4 in <option>")
+def _fully_implicit(model: mujoco.MjModel) -> Iterator[str]:
+    yield from _integrator_if(model, model.opt.integrator == _Integrator.mjINT_IMPLICIT)
+
+
+def _integrator_if(model: mujoco.MjModel, is_refused: bool) -> Iterator[str]:
+    if is_refused:
+        name = _Integrator(model.opt.integrator).name.removeprefix("mjINT_").lower()
+        yield f'integrator="{name}"'
+
+
+@FEATURES.entry(EVERY_ENGINE, "actuator", "user dynamics of an activation", "use another dyntype")
+def _user_dynamics(model: mujoco.MjModel) -> Mask:
+    """Motors whose activation a callback changes."""
+    return model.actuator_dyntype == mujoco.mjtDyn.mjDYN_USER
+
+
+@FEATURES.entry(_MJX, "actuator", "PID controllers", "use <position>")
+def _pid_motors(model: mujoco.MjModel) -> Mask:
+    is_pid = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_PID
+    return is_pid | (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_PID)
+
+
+@FEATURES.entry(
+    ("warp",), "actuator", "filterexact and inductance with RK4", 'set integrator="implicitfast", or dyntype="filter"'
+)
+def _exact_filters_with_rk4(model: mujoco.MjModel) -> Mask:
+    """Motors whose activation Warp advances by another formula than MuJoCo in the stages of RK4."""
+    is_exact = np.isin(model.actuator_dyntype, (mujoco.mjtDyn.mjDYN_FILTEREXACT, mujoco.mjtDyn.mjDYN_DCMOTOR))
+    return is_exact & (model.actuator_actadr >= 0) & (model.opt.integrator == _Integrator.mjINT_RK4)
 
 
 @FEATURES.entry(EVERY_ENGINE, "actuator", "actuators with a delay", "remove nsample and delay")
@@ -153,22 +192,9 @@ def _slippery_contacts(model: mujoco.MjModel) -> Iterator[str]:
     if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
         return
     geoms, pairs = pairs_that_move(model)
-    condim, friction = _contact_friction(model, geoms, pairs)
+    condim, friction = contact_friction(model, geoms, pairs)
     for both in geoms[(condim > 1) & (friction < _LEAST_PYRAMIDAL_FRICTION)]:
-        yield "geoms " + " and ".join(f"'{model.geom(int(geom)).name or geom}'" for geom in both)
-
-
-def _contact_friction(
-    model: mujoco.MjModel, geoms: Int[np.ndarray, "n 2"], pairs: Int[np.ndarray, " n"]
-) -> tuple[Int[np.ndarray, " n"], Shaped[np.ndarray, " n"]]:
-    """Dimension and sliding friction of the contacts of pairs of geoms, as C combines them."""
-    priority = model.geom_priority[geoms]
-    is_used = priority == priority.max(axis=1, keepdims=True)
-    condim = np.where(is_used, model.geom_condim[geoms], 0).max(axis=1)
-    friction = np.where(is_used, model.geom_friction[geoms, 0], 0.0).max(axis=1)
-    is_own = pairs >= 0
-    condim[is_own], friction[is_own] = model.pair_dim[pairs[is_own]], model.pair_friction[pairs[is_own], 0]
-    return condim, friction
+        yield names_of_pair(model, both)
 
 
 @FEATURES.entry(_MJX, None, "the noslip solver as MuJoCo does", "set noslip_iterations to 0 in <option>")

@@ -92,8 +92,9 @@ class MjxWalkEnv(CompiledEnv, MujocoAttributes, gymnasium.Env):
 
     def _write_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
         refuse_fork()
-        warmstart = None if self._state is None else self._state.physics.qacc_warmstart
-        self._state, _ = self._programs.reset_to(qpos, qvel, warmstart)
+        # As in Gymnasium, the solver's initial guess and activations stay.
+        kept = () if self._state is None else (self._state.physics.qacc_warmstart, self._state.physics.act)
+        self._state, _ = self._programs.reset_to(qpos, qvel, *kept)
 
     def __getstate__(self) -> dict[str, object]:
         return super().__getstate__() | {"_init": (self.init_qpos, self.init_qvel)}

@@ -41,8 +41,14 @@ class Programs:
         offset = 0.0 if self.task.reward_hashes else self.task.REWARD_OFFSET
         return np.where(np.asarray(state.metrics["nonfinite"]) > 0, 0.0, sum(terms) + offset)
 
-    def _reset_to(self, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array | None = None) -> tuple[State, Info]:
-        state = self.task.reset_to(qpos, qvel, warmstart)
+    def _reset_to(
+        self,
+        qpos: jax.Array,
+        qvel: jax.Array,
+        warmstart: jax.Array | None = None,
+        act: jax.Array | None = None,
+    ) -> tuple[State, Info]:
+        state = self.task.reset_to(qpos, qvel, warmstart, act)
         return state, self.task.reset_info(state)
 
     def _step(self, state: State, action: jax.Array) -> tuple[State, Info]:

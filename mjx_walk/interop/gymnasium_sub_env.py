@@ -64,6 +64,7 @@ class SubEnv(MujocoAttributes):
         env, i = self._vector_env, self._index
         if env._state is None:
             raise gymnasium.error.ResetNeeded("call reset before set_state")
-        new, _ = env._programs.reset_to(qpos, qvel, env._state.physics.qacc_warmstart[i])
+        _, _, warmstart, act = jax.tree.map(lambda x: x[i], env._state.physics)
+        new, _ = env._programs.reset_to(qpos, qvel, warmstart, act)  # as in Gymnasium, activations stay
         new = new.replace(steps=env._state.steps[i])
         env._state = jax.tree.map(lambda x, y: x.at[i].set(y), env._state, new)

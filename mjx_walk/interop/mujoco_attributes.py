@@ -186,6 +186,9 @@ class MujocoAttributes:
         self._gymnasium_env.close()
 
     def _show_state(self) -> None:
+        state = self._read_state()
+        if state is not None and state.physics.act is not None:
+            self._gymnasium_env.data.act[:] = state.physics.act
         self._gymnasium_env.set_state(*self._position_and_velocity())
 
     def _position_and_velocity(self) -> tuple[np.ndarray, np.ndarray]:

@@ -60,6 +60,9 @@ class TaskEnv(gymnasium.Env):
     def _show(self, action: np.ndarray) -> None:
         """Copy the physics state to `data`, and compute what is drawn from it."""
         assert self._state is not None
-        self.data.qpos[:], self.data.qvel[:] = self._state.physics.qpos, self._state.physics.qvel
+        physics = self._state.physics
+        self.data.qpos[:], self.data.qvel[:] = physics.qpos, physics.qvel
+        if physics.act is not None:
+            self.data.act[:] = physics.act
         self.data.ctrl[:] = action
         mujoco.mj_forward(self.model, self.data)

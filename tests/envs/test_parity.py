@@ -58,14 +58,6 @@ def test_one_step_from_standing_airborne_thrown_and_fallen_states(name, version,
         assert 100 < found.num_terminations < found.num_steps - 100
 
 
-@pytest.mark.parametrize("physics", ["jax", "warp", "c"])
-@pytest.mark.parametrize("integrator", ["implicit", "implicitfast"])
-def test_implicit_integrators_are_refused(physics, integrator):
-    model = mujoco.MjModel.from_xml_string(TILTED_CAPSULE.replace("RK4", integrator))
-    with pytest.raises(UserError, match=f"integrator '{integrator}' is not supported; set integrator to Euler or RK4"):
-        make_engine(physics, model, 1, ())
-
-
 @pytest.mark.parametrize("physics", ["jax", "warp"])
 def test_euler_damps_joints_implicitly(physics):
     """With explicit damping, a light joint with strong damping would blow up at this time step."""

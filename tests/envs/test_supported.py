@@ -62,11 +62,32 @@ CAPSULES = """
   </worldbody>
 </mujoco>
 """
+TETRAHEDRON = '<mesh name="tetrahedron" vertex="0 0 0 .2 0 0 0 .2 0 0 0 .2"/>'
 ALL, MJX, JAX, WARP = ("c", "jax", "warp"), ("jax", "warp"), ("jax",), ("warp",)
 
 REFUSED = {
-    "filter": (ALL, {"motor": GENERAL.format('dyntype="filter" dynprm=".05"')}, "an activation state (motor 'm')"),
-    "integrator": (ALL, {"motor": GENERAL.format('dyntype="integrator"')}, "an activation state (motor 'm')"),
+    "user_dynamics": (
+        ALL,
+        {"motor": GENERAL.format('dyntype="user" actdim="1"')},
+        "user dynamics of an activation (motor 'm')",
+    ),
+    "actearly": (JAX, {"motor": GENERAL.format('dyntype="filter" dynprm=".05" actearly="true"')}, "actearly (motor 'm')"),
+    "dcmotor": (
+        JAX,
+        {"motor": '<dcmotor name="m" joint="knee" motorconst=".05" resistance="1" ctrlrange="-1 1"/>'},
+        "direct-current motors and orientation servos (motor 'm')",
+    ),
+    "pid": (MJX, {"motor": '<pid name="m" joint="knee" kp="5" ki="1" ctrlrange="-1 1"/>'}, "PID controllers (motor 'm')"),
+    "filterexact_rk4": (
+        WARP,
+        {"option": 'integrator="RK4"', "motor": GENERAL.format('dyntype="filterexact" dynprm=".05"')},
+        "filterexact and inductance with RK4 (motor 'm'); set integrator=",
+    ),
+    "implicitfast_in_water": (
+        JAX,
+        {"option": 'integrator="implicitfast" density="1000"'},
+        "implicitfast in a medium (density); set density and viscosity to 0",
+    ),
     "delay": (ALL, {"motor": MOTOR.format('delay=".01" nsample="4"')}, "actuators with a delay (motor 'm')"),
     "sensor_delay": (
         ALL,
@@ -74,7 +95,12 @@ REFUSED = {
         "sensors with a history (sensor 's')",
     ),
     "sleep": (ALL, {"flag": '<flag sleep="enable"/>'}, 'sleeping bodies (<flag sleep="enable"/>)'),
-    "implicit": (ALL, {"option": 'integrator="implicit"'}, "integrator 'implicit' is not supported"),
+    "discrete": (ALL, {"option": 'integrator="discrete"'}, 'this integrator (integrator="discrete"); set integrator to'),
+    "implicit": (
+        MJX,
+        {"option": 'integrator="implicit"'},
+        'this integrator (integrator="implicit"); set integrator to implicitfast, Euler or RK4 in <option>, or use physics=c',
+    ),
     "group": (
         MJX,
         {"option": 'actuatorgroupdisable="2"', "motor": MOTOR.format('group="2"')},
@@ -205,7 +231,17 @@ REFUSED = {
     "cylinder_box": (
         JAX,
         {"torso": 'type="cylinder" size=".1 .05"', "world": '<geom type="box" size=".1 .1 .02" pos=".05 0 0"/>'},
-        "collisions not implemented",
+        "contacts of these types of geoms (cylinder and box, geoms 'torso' and",
+    ),
+    "elliptic_condim1": (
+        JAX,
+        {"option": 'cone="elliptic"', "floor": 'condim="1"', "shin": 'condim="1"'},
+        "elliptic contacts without friction (geoms 'floor' and 'shin'); set condim",
+    ),
+    "mesh_margin": (
+        JAX,
+        {"asset": TETRAHEDRON, "torso": 'type="mesh" mesh="tetrahedron" margin=".01"'},
+        "a margin of meshes and height fields (geoms 'floor' and 'torso')",
     ),
 }
 """For each feature: the engines that refuse it, the model's parts, and what the error says."""
