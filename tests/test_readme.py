@@ -225,6 +225,8 @@ def test_every_command(line, small_run, tmp_path, monkeypatch, capfd):
         arguments = ["draw=true", f"out={small_run.parent}"]
     elif name == "train" and not {"--cfg", "--help"} & {*arguments}:
         arguments += [*sizes(arguments), "total_steps=1", "evaluation.gymnasium_episodes=1"]
+    elif "robustness=true" in arguments:
+        arguments += ["episodes=1"]
     elif name == "play":
         arguments += ["width=96", "height=64"]
     elif name == "compare":
