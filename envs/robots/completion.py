@@ -74,8 +74,17 @@ def _check_root(model: mujoco.MjModel, xml_file: str) -> None:
         raise UserError(f"{xml_file} has no free joint, so it cannot walk; add <freejoint/> to the robot's root body")
     if not is_free[0]:
         raise UserError(f"the first joint of {xml_file} is not the robot's free joint; put the robot first")
-    if not (model.jnt_type == _JNT.mjJNT_HINGE).any():
-        raise UserError(f"{xml_file} has no hinge, so no servo can move it; add joints to its limbs")
+    if not _hinges(model).size:
+        body = model.body(model.jnt_bodyid[0]).name or "1"
+        raise UserError(
+            f"the body '{body}' of {xml_file}, the first with a free joint, has no hinge that a servo can move"
+        )
+
+
+def _hinges(model: mujoco.MjModel) -> Int[np.ndarray, " hinges"]:
+    """Hinges of the body with the first joint and of its limbs."""
+    is_robots = model.body_rootid[model.jnt_bodyid] == model.body_rootid[model.jnt_bodyid[0]]
+    return np.flatnonzero(is_robots & (model.jnt_type == _JNT.mjJNT_HINGE))
 
 
 def _floors(model: mujoco.MjModel) -> Int[np.ndarray, " floors"]:
@@ -115,15 +124,15 @@ def _first_pose(model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
 
 def _add_servos(spec: mujoco.MjSpec, model: mujoco.MjModel, motors: Motors) -> bool:
     """Add a servo to each hinge."""
-    joints = np.flatnonzero(model.jnt_type == _JNT.mjJNT_HINGE)
-    limits = [_joint_limit(model, joint) for joint in joints]
+    joints = _hinges(model)
+    limits = [_joint_limit(model, int(joint)) for joint in joints]
     pose = _first_pose(model)
     found = gains(model, pose, joints, limits, motors)
-    targets = [joint for joint in spec.joints if joint.type == _JNT.mjJNT_HINGE]
-    for joint, target, one in zip(joints, targets, found, strict=True):
+    for joint, one in zip(joints, found, strict=True):
+        target = spec.joints[joint]
         target.name = target.name or f"hinge_{joint}"
         servo = spec.add_actuator(name=f"{target.name}_servo", target=target.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        _make_servo(servo, one, _range(model, pose, joint))
+        _make_servo(servo, one, _range(model, pose, int(joint)))
     _log("has no motors: added position servos to its hinges", joints, found)
     return True
 

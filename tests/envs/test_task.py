@@ -16,7 +16,7 @@ import pytest
 from shapes import check_shapes
 from toy_tasks import MountainCar
 
-from mjx_walk.envs import TASKS, TrainableTask, make_env
+from mjx_walk.envs import GYMNASIUM_TASKS, TASKS, TrainableTask, make_env
 from mjx_walk.envs.physics import base
 from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.utils.errors import UserError
@@ -70,7 +70,7 @@ def test_nested_vmap_calls_a_batched_function_once():
     assert empty.shape == (3, 4, 0) and sizes[-1] == (12, 0)
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", GYMNASIUM_TASKS)
 def test_nonfinite_physics_terminates_and_is_not_returned(name):
     task = make_env(name, physics="c")
     good = task.reset(jax.random.PRNGKey(0))
@@ -112,7 +112,7 @@ def test_state_holds_no_derived_arrays():
     assert sum(x.size for x in jax.tree.leaves(state)) < task.observation_size + 100
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", GYMNASIUM_TASKS)
 def test_shapes_equal_the_annotations(name, monkeypatch):
     methods = (
         "reset",
@@ -133,7 +133,7 @@ def test_shapes_equal_the_annotations(name, monkeypatch):
         task.reset_to(task.init_qpos.reshape(1, -1), task.init_qvel)
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", GYMNASIUM_TASKS)
 def test_actions_are_scaled_to_gymnasiums_units(name):
     task = make_env(name, physics="c")
     np.testing.assert_array_equal(task.scale_action(jnp.full(task.action_size, -2.0)), task.action_low)
