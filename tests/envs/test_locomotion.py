@@ -170,7 +170,7 @@ def test_what_needs_a_model_says_so(path):
         make_env("locomotion", physics="c")
     with pytest.raises(UserError, match="locomotion has no equivalent in Gymnasium, so it has no v4"):
         make_env("locomotion", physics="c", xml_file=path, version="v4")
-    with pytest.raises(UserError, match="unknown key 'env.motors.kq'"):
+    with pytest.raises(UserError, match=r"unknown key 'env\.motors\.kq'"):
         make_env("locomotion", physics="c", xml_file=path, motors={"kq": 1.0})
     with pytest.raises(UserError, match=r"Gymnasium has no equivalent of locomotion; step it with mjx_walk\.make_env"):
         gymnasium.make("mjx_walk/Walker2d-v5", env="locomotion", xml_file=path)

@@ -132,7 +132,10 @@ def test_feet_are_found_or_named(tmp_path):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"root": "", "angles": None}, "robot.xml has no free joint, so it cannot walk; add <freejoint/> to the robot's root body"),
+        (
+            {"root": "", "angles": None},
+            "robot.xml has no free joint, so it cannot walk; add <freejoint/> to the robot's root body",
+        ),
         ({"before": OTHER_BODY, "angles": None}, "the body '1' of .*, the first with a free joint, has no hinge"),
         (
             {"before": '<body><joint/><geom size="1"/></body>', "angles": None},
