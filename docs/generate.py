@@ -11,7 +11,7 @@ from generator.markdown import toctree, with_block
 
 from mjx_walk import zoo
 from mjx_walk.algos import BUILT_IN_ALGORITHMS
-from mjx_walk.envs import BUILT_IN_TASKS
+from mjx_walk.envs import BUILT_IN_TASKS, GYMNASIUM_TASKS
 
 DOCS = Path(__file__).parent
 _OF_SCORES = ("best_evaluations", "complete_episodes", "cpu", "cpu_tasks", "robustness", "slm_lab_drafts")
@@ -20,14 +20,16 @@ _OF_SCORES = ("best_evaluations", "complete_episodes", "cpu", "cpu_tasks", "robu
 
 def pages() -> dict[Path, str]:
     """Every page with generated parts, as it must be, by its path."""
-    found = {DOCS / "tasks" / f"{name}.md": task_pages.page(name) for name in BUILT_IN_TASKS}
-    index = {"tasks": task_pages.overview_of_all(), "pages": toctree(BUILT_IN_TASKS)}
+    found = {DOCS / "tasks" / f"{name}.md": task_pages.page(name) for name in GYMNASIUM_TASKS}
+    index = {"tasks": task_pages.overview_of_all(), "pages": toctree(GYMNASIUM_TASKS)}
     found[DOCS / "tasks" / "index.md"] = _filled("tasks/index.md", index)
     groups = {name: setting_tables.group_table(name) for name in setting_tables.GROUPS}
     found[DOCS.parent / "README.md"] = _filled("../README.md", {"best": best_recipes.summary()})
     for page, blocks in _figures().items():
         found[DOCS / page] = _filled(page, blocks)
     found[DOCS / "training.md"] = _filled("training.md", {"scaling-summary": scaling.summary()})
+    robots = {name: setting_tables.task_tables(name) for name in BUILT_IN_TASKS if name not in GYMNASIUM_TASKS}
+    found[DOCS / "your_own.md"] = _filled("your_own.md", robots)
     found[DOCS / "configuration.md"] = _filled("configuration.md", groups)
     texts = {name: (DOCS / "algorithms" / f"{name}.md").read_text() for name in BUILT_IN_ALGORITHMS}
     index = {"algorithms": setting_tables.algorithms(texts), "pages": toctree(BUILT_IN_ALGORITHMS)}

@@ -9,7 +9,7 @@ import imageio.v3 as iio
 
 import mjx_walk
 from mjx_walk.cli.parsing import stay_on_cpu
-from mjx_walk.envs import BUILT_IN_TASKS
+from mjx_walk.envs import GYMNASIUM_TASKS
 from mjx_walk.viewing.episode import record_episode
 
 TASKS = Path(__file__).parent / "tasks"
@@ -28,5 +28,5 @@ def draw(name: str) -> None:
 
 if __name__ == "__main__":
     stay_on_cpu()
-    for name in BUILT_IN_TASKS:
+    for name in GYMNASIUM_TASKS:
         draw(name)

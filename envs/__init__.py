@@ -10,7 +10,7 @@ if __name__ != "mjx_walk.envs":  # a second import under another name would dupl
 import dataclasses
 from typing import Any
 
-from mjx_walk.envs.registry import BUILT_IN_TASKS, TASKS, register_task
+from mjx_walk.envs.registry import BUILT_IN_TASKS, GYMNASIUM_TASKS, TASKS, register_task
 from mjx_walk.envs.state import NO_TIME_LIMIT, State, TrainableTask
 from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions, with_absolute_paths
@@ -23,6 +23,7 @@ from mjx_walk.utils.setting_fields import validate
 
 __all__ = [
     "BUILT_IN_TASKS",
+    "GYMNASIUM_TASKS",
     "NO_TIME_LIMIT",
     "TASKS",
     "State",

@@ -26,18 +26,50 @@ def plane_velocity(velocity: Float[Array, "2"]) -> Info:
 
 
 class GymnasiumInfo:
-    """The part of a task that gives Gymnasium's `info`. Training does not use it.
+    """The part of a task that names its equivalent in Gymnasium, and gives Gymnasium's `info`.
 
-    All methods take the states of one environment, of a task with `keep_info`.
+    Methods that take states take those of one environment, of a task with `keep_info`.
     """
 
     options: TaskOptions
+    GYMNASIUM_NAME: str
+    """Name in Gymnasium's registry, without the version. A class without a name has no equivalent in Gymnasium."""
     REWARD_TERMS: dict[str, tuple[str, ...]]
+    """Signed reward terms of each version, under the names of Gymnasium's `info`."""
     V4_INFO_HAS_TERMS: bool = True
     """Whether the `info` of Gymnasium's v4 class holds the reward terms. That of v5 always does."""
     REWARD_OFFSET: float = 0.0
     """Constant part of Gymnasium's reward, which no term holds."""
     reward_terms: tuple[str, ...]
+
+    @classmethod
+    def has_gymnasium_name(cls) -> bool:
+        """Whether Gymnasium has an equivalent environment. A subclass does not inherit it."""
+        return "GYMNASIUM_NAME" in vars(cls)
+
+    @property
+    def is_in_gymnasium(self) -> bool:
+        """The same, of this task."""
+        return self.has_gymnasium_name()
+
+    @classmethod
+    def id_of(cls, options: TaskOptions) -> str:
+        """Id of the equivalent environment in Gymnasium; without one, the task's name."""
+        return f"{cls.GYMNASIUM_NAME}-{options.version}" if cls.has_gymnasium_name() else options.name
+
+    @property
+    def gymnasium_id(self) -> str:
+        """The same, of this task."""
+        return self.id_of(self.options)
+
+    def gymnasium_kwargs(self) -> dict[str, object]:
+        """Keyword arguments of `gymnasium.make` for the equivalent environment, without those at their default."""
+        return self.options.gymnasium_kwargs()
+
+    @property
+    def gymnasium_reward_terms(self) -> tuple[str, ...]:
+        """Names of the terms of Gymnasium's reward."""
+        return self.REWARD_TERMS[self.options.version]
 
     @property
     def has_custom_reward(self) -> bool:

@@ -24,6 +24,7 @@ __all__ = [
     "check_pose",
     "is_coordinate",
     "load_model",
+    "model_file",
     "warn_of_changed_sources",
     "warn_of_coordinates",
 ]
@@ -50,6 +51,17 @@ class ModelNeeds(NamedTuple):
     sites: int = 0
     is_exact: bool = False
     """Whether a model with more positions or velocities is refused, too."""
+
+
+def model_file(xml_file: str | None, task: str) -> str:
+    """The model file of a task.
+
+    Raises:
+        UserError: the task has no model of its own, and none is given.
+    """
+    if xml_file is None:
+        raise UserError(f"{task} has no model of its own; give the MuJoCo model of a robot: env.xml_file=PATH")
+    return xml_file
 
 
 def load_model(xml_file: str) -> mujoco.MjModel:

@@ -11,6 +11,7 @@ from mjx_walk.envs.humanoid import Humanoid, HumanoidOptions
 from mjx_walk.envs.humanoid_standup import HumanoidStandup, HumanoidStandupOptions
 from mjx_walk.envs.inverted_double_pendulum import InvertedDoublePendulum, InvertedDoublePendulumOptions
 from mjx_walk.envs.inverted_pendulum import InvertedPendulum, InvertedPendulumOptions
+from mjx_walk.envs.locomotion import Locomotion, LocomotionOptions
 from mjx_walk.envs.pusher import Pusher, PusherOptions
 from mjx_walk.envs.reacher import Reacher, ReacherOptions
 from mjx_walk.envs.swimmer import Swimmer, SwimmerOptions
@@ -24,6 +25,7 @@ from mjx_walk.utils.setting_fields import with_name
 
 __all__ = [
     "BUILT_IN_TASKS",
+    "GYMNASIUM_TASKS",
     "TASKS",
     "is_registered_from",
     "register_task",
@@ -44,9 +46,12 @@ TASKS: dict[str, tuple[type[Task], type[TaskOptions]]] = {
     "pusher": (Pusher, PusherOptions),
     "inverted_pendulum": (InvertedPendulum, InvertedPendulumOptions),
     "inverted_double_pendulum": (InvertedDoublePendulum, InvertedDoublePendulumOptions),
+    "locomotion": (Locomotion, LocomotionOptions),
 }
 BUILT_IN_TASKS: tuple[str, ...] = tuple(TASKS)
 """Names that a user's task cannot take."""
+GYMNASIUM_TASKS: tuple[str, ...] = tuple(name for name, (task, _) in TASKS.items() if task.has_gymnasium_name())
+"""The tasks of this package that have an equivalent in Gymnasium, and so a model of their own."""
 
 _RESERVED = ("all",)
 """Values of `env=` with a meaning of their own."""

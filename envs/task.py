@@ -4,6 +4,7 @@ import abc
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
@@ -32,12 +33,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     Subclasses define observations, rewards and terminations. They do not depend on the engine.
     """
 
-    GYMNASIUM_NAME: str
-    """Name in Gymnasium's registry, without the version. A class without a name has no equivalent in Gymnasium."""
-    XML_FILES: dict[str, str]
-    """Model file of each version, among Gymnasium's assets."""
-    REWARD_TERMS: dict[str, tuple[str, ...]]
-    """Signed reward terms of each version, under the names of Gymnasium's `info`."""
+    XML_FILES: dict[str, str | None]
+    """Model file of each version, among Gymnasium's assets. None: the task has no model, and needs `xml_file`."""
     V5_ONLY: tuple[str, ...] = ("xml_file", "frame_skip")
     """Env options that Gymnasium's v4 class does not take."""
     V4_ONLY: tuple[str, ...] = ()
@@ -72,22 +69,21 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         check_version(options, self.XML_FILES, self.MISSING_VERSIONS, {"v5": self.V5_ONLY, "v4": self.V4_ONLY})
         self.options = options = with_absolute_paths(options, working_folder())
         self.max_episode_steps = options.max_episode_steps
-        self.model_file = options.xml_file or self.XML_FILES[options.version]
-        self.model = models.load_model(self.model_file)
+        self.model_file = models.model_file(options.xml_file or self.XML_FILES[options.version], options.name)
+        self.model = self.load_model()
         self.model_sources = source_hashes(self.model_file)
         self.body_ids = {body: models.body_id(self.model, body) for body in self.named_bodies()}
         models.check_model(self.model, options.name, self.MODEL_NEEDS)
         if options.xml_file:
             models.warn_of_coordinates(self.model, options.name, self.HAS_X, self.HEIGHT_INDEX)
         self.view = self.VIEW._replace(body=min(self.VIEW.body, self.model.nbody - 1))
-        self.dt = self.model.opt.timestep * options.frame_skip
+        self.dt = self.model.opt.timestep * self.num_substeps()
         self.kept_arrays = self.info_arrays() if keep_info else ()
         derived = tuple(dict.fromkeys((*self.derived_names(), *self.kept_arrays)))
-        self.engine = make_engine(resolve_engine(physics), self.model, options.frame_skip, derived)
+        self.engine = make_engine(resolve_engine(physics), self.model, self.num_substeps(), derived)
         models.check_pose(self.model, derived)
         self._snapshot = ModelSnapshot(self.model, derived)
-        low, high = self.model.actuator_ctrlrange.T
-        self.action_low, self.action_high = jnp.float32(low), jnp.float32(high)
+        self.action_low, self.action_high = map(jnp.float32, self.action_range())
         self.action_size = self.model.nu
         self.init_qpos = jnp.asarray(self.model.qpos0, jnp.float32)
         self.init_qvel = jnp.zeros(self.model.nv, jnp.float32)
@@ -109,33 +105,9 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         check_shaping(self.options.shaping, self.options.name, has_x, has_y, has_motors, can_fall)
 
     @property
-    def is_in_gymnasium(self) -> bool:
-        """Whether Gymnasium has an equivalent environment. A subclass does not inherit it."""
-        return "GYMNASIUM_NAME" in vars(type(self))
-
-    @classmethod
-    def id_of(cls, options: TaskOptions) -> str:
-        """Id of the equivalent environment in Gymnasium; without one, the task's name."""
-        return f"{cls.GYMNASIUM_NAME}-{options.version}" if "GYMNASIUM_NAME" in vars(cls) else options.name
-
-    @property
-    def gymnasium_id(self) -> str:
-        """The same, of this task."""
-        return self.id_of(self.options)
-
-    def gymnasium_kwargs(self) -> dict[str, object]:
-        """Keyword arguments of `gymnasium.make` for the equivalent environment, without those at their default."""
-        return self.options.gymnasium_kwargs()
-
-    @property
     def reward_hashes(self) -> dict[str, str]:
         """SHA-256 of the reward function's files, by absolute path; empty without a reward function."""
         return self._reward_function.hashes if self._reward_function else {}
-
-    @property
-    def gymnasium_reward_terms(self) -> tuple[str, ...]:
-        """Names of the terms of Gymnasium's reward."""
-        return self.REWARD_TERMS[self.options.version]
 
     @property
     def has_custom_reward(self) -> bool:
@@ -153,6 +125,18 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         """Bodies that `observe`, `carry` and `reward_and_termination` read, as keys of `body_ids`."""
         return ()
 
+    def load_model(self) -> mujoco.MjModel:
+        """The model of `model_file`. A task may complete it."""
+        return models.load_model(self.model_file)
+
+    def num_substeps(self) -> int:
+        """Physics steps of one environment step."""
+        return self.options.frame_skip
+
+    def action_range(self) -> Float[np.ndarray, "2 action_size"]:
+        """Lowest and highest actions, in the motors' units."""
+        return self.model.actuator_ctrlrange.T
+
     @abc.abstractmethod
     def initial_state(self, key: PRNGKeyArray) -> InitialState:
         """Draw the position and velocity of a reset. Source: `reset_model` of the Gymnasium class."""
@@ -167,11 +151,25 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 
     @abc.abstractmethod
     def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " observation_size"]:
-        """Observation, in Gymnasium's order and units."""
+        """Observation of the physics, in Gymnasium's order and units."""
+
+    def observe_all(self, physics: PhysicsState, derived: Derived, carry: Carry) -> Float[Array, " observation_size"]:
+        """Observation. A task that observes its carry overrides it."""
+        return self.observe(physics, derived)
 
     def carry(self, physics: PhysicsState, derived: Derived) -> Carry:
         """Quantities that the next step's reward needs, in addition to the physics state."""
         return {}
+
+    def initial_carry(self, key: PRNGKeyArray, physics: PhysicsState, derived: Derived) -> Carry:
+        """The carry of a reset. A task that draws random values for its episodes overrides it."""
+        return self.carry(physics, derived)
+
+    def next_carry(
+        self, before: State, physics: PhysicsState, derived: Derived, action: Float[Array, " action_size"]
+    ) -> Carry:
+        """The carry after a step. A task whose carry depends on the former one, in `before.memory`, overrides it."""
+        return self.carry(physics, derived)
 
     @abc.abstractmethod
     def reward_and_termination(
@@ -193,7 +191,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     @standard_dtypes()
     def reset(self, key: PRNGKeyArray) -> State:
         """Random initial state, drawn by `initial_state`."""
-        return self.reset_to(*self.initial_state(key))
+        return self.reset_to(*self.initial_state(key), key=jax.random.fold_in(key, 1))
 
     @standard_dtypes()
     def reset_to(
@@ -202,6 +200,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         qvel: Float[Array | np.ndarray, " nv"],
         warmstart: Float[Array | np.ndarray, " nv"] | None = None,
         act: Float[Array | np.ndarray, " na"] | None = None,
+        key: PRNGKeyArray | None = None,
     ) -> State:
         """Initial state at a given position and velocity. Source: Gymnasium's `set_state` after a reset.
 
@@ -210,6 +209,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
             qvel: m/s and rad/s.
             warmstart: initial guess of the constraint solver (`qacc_warmstart`), m/s² and rad/s². Default: zeros.
             act: activations of actuators. Default: zeros, as after `mj_resetData`.
+            key: for the random values of the task's carry. Default: seed 0.
 
         Raises:
             UserError: another shape, or `model` has changed. A traced reset raises it while it is traced.
@@ -221,10 +221,11 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         warmstart = jnp.zeros_like(qvel) if warmstart is None else jnp.asarray(warmstart, jnp.float32)
         physics = PhysicsState(qpos, qvel, warmstart, activation(na, act))
         derived = self.engine.forward(physics)
+        carry = self.initial_carry(jax.random.PRNGKey(0) if key is None else key, physics, derived)
         return State(
             physics=physics,
-            memory=self.carry(physics, derived) | self._kept(derived),
-            obs=self.observe(physics, derived),
+            memory=carry | self._kept(derived),
+            obs=self.observe_all(physics, derived, carry),
             reward=jnp.zeros((), jnp.float32),
             terminated=jnp.zeros((), bool),
             truncated=jnp.zeros((), bool),
@@ -252,8 +253,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         check_action_shape(action, (self.action_size,))
         action = jnp.asarray(action, jnp.float32)
         physics, derived, overflow = self.engine.step(state.physics, action)
-        carry = self.carry(physics, derived) | self._kept(derived)
-        obs = self.observe(physics, derived)
+        carry = self.next_carry(state, physics, derived, action) | self._kept(derived)
+        obs = self.observe_all(physics, derived, carry)
         terms, reward, terminated = self.reward_and_termination(state, physics, derived, carry, action)
         terms, reward = self._customize_reward(
             RewardStep(terms, reward, state.physics, physics, obs, action, terminated, self.dt)

@@ -44,11 +44,13 @@ class TaskOptions:
         for name, value in list(vars(self).items()):
             if isinstance(value, list):  # a configuration file gives a range as a list
                 setattr(self, name, tuple(value))
-        if isinstance(self.shaping, dict):
-            unknown = self.shaping.keys() - {field.name for field in dataclasses.fields(Shaping)}
-            if unknown:
-                raise UserError(f"unknown key 'env.shaping.{min(unknown)}'")
-            self.shaping = Shaping(**self.shaping)
+        for group in dataclasses.fields(self):
+            values, kind = getattr(self, group.name), group.default_factory
+            if isinstance(values, dict) and isinstance(kind, type) and dataclasses.is_dataclass(kind):
+                unknown = values.keys() - {field.name for field in dataclasses.fields(kind)}
+                if unknown:
+                    raise UserError(f"unknown key 'env.{group.name}.{min(unknown)}'")
+                setattr(self, group.name, kind(**values))
 
     def changed(self) -> dict[str, object]:
         """Options that differ from their defaults."""

@@ -5,7 +5,7 @@ import sys
 import warnings
 
 from mjx_walk.cli import parsing
-from mjx_walk.envs import TASKS, make_env
+from mjx_walk.envs import GYMNASIUM_TASKS, TASKS, make_env
 from mjx_walk.evaluation.engine_parity import check
 from mjx_walk.evaluation.random_steps import take_random_steps
 from mjx_walk.machine.devices import default_device
@@ -28,7 +28,7 @@ on the CPU. Exits with 1 if an error exceeds its tolerance.
 @dataclasses.dataclass
 class Arguments:
     physics: str = setting("warp", choices=("warp", "jax"))
-    env: str = setting("all", choices=("all", *TASKS))
+    env: str = setting("all", choices=("all", *GYMNASIUM_TASKS))
     version: str = setting("v5", choices=("v5", "v4"))
     num_envs: int | None = setting(None, at_least=3)
     steps: int = setting(60, at_least=1)
@@ -41,7 +41,7 @@ def main(command_line: list[str]) -> int:
     arguments = parsing.parse(Arguments, [_with_present_name(argument) for argument in command_line], USAGE)
     is_within = True
     one = _random_steps if arguments.random_steps else _single_steps
-    every = [name for name, (task, _) in TASKS.items() if arguments.version in task.XML_FILES]
+    every = [name for name in GYMNASIUM_TASKS if arguments.version in TASKS[name][0].XML_FILES]
     for name in every if arguments.env == "all" else (arguments.env,):
         is_within &= one(name, arguments)
     print("within tolerance" if is_within else "EXCEEDS its tolerance", file=sys.stderr)

@@ -9,7 +9,7 @@ import pytest
 from helpers import CLONE
 
 from mjx_walk.algos import BUILT_IN_ALGORITHMS
-from mjx_walk.envs import BUILT_IN_TASKS, TASKS
+from mjx_walk.envs import BUILT_IN_TASKS, GYMNASIUM_TASKS, TASKS
 from mjx_walk.utils import setting_fields
 
 DOCS = CLONE / "docs"
@@ -27,9 +27,9 @@ def test_committed_pages_are_what_the_code_gives():
     names = {Path(os.path.relpath(path, DOCS)).as_posix() for path in pages}
     assert names == {
         *("../README.md", "results.md", "results_archive.md", "speed.md", "training.md"),
-        *(f"tasks/{name}.md" for name in ("index", *BUILT_IN_TASKS)),
+        *(f"tasks/{name}.md" for name in ("index", *GYMNASIUM_TASKS)),
         *(f"algorithms/{name}.md" for name in ("index", *BUILT_IN_ALGORITHMS)),
-        "configuration.md",
+        *("configuration.md", "your_own.md"),
     }
 
 
@@ -49,7 +49,7 @@ def test_every_page_is_listed(folder):
 
 def test_every_setting_has_a_meaning():
     schemas = importlib.import_module("generator.setting_tables").all_schemas()
-    assert len(schemas) == 5 + len(BUILT_IN_TASKS) + len(BUILT_IN_ALGORITHMS)
+    assert len(schemas) == 5 + len(BUILT_IN_TASKS) + len(BUILT_IN_ALGORITHMS) + 2  # motors and weights of locomotion
     for schema in schemas:
         meanings = setting_fields.meanings(schema)
         missing = {row.name for row in setting_fields.table(schema)} - {*meanings, "name", "env", "algo"}
@@ -59,6 +59,6 @@ def test_every_setting_has_a_meaning():
 
 def test_every_reward_term_has_its_words():
     texts = importlib.import_module("generator.task_texts").TEXTS
-    assert texts.keys() == {*BUILT_IN_TASKS}
+    assert texts.keys() == {*GYMNASIUM_TASKS}
     for name, text in texts.items():
         assert text.rewards.keys() == {term for terms in TASKS[name][0].REWARD_TERMS.values() for term in terms}

@@ -16,7 +16,7 @@ from helpers import OLD_RUNS, renders
 import mjx_walk
 from mjx_walk import compare, play, zoo
 from mjx_walk.cli import parsing
-from mjx_walk.envs import TASKS
+from mjx_walk.envs import GYMNASIUM_TASKS, TASKS
 from mjx_walk.settings.config import load_config
 from mjx_walk.training import launcher
 from mjx_walk.utils.errors import UserError
@@ -24,7 +24,11 @@ from mjx_walk.utils.errors import UserError
 TABLES = Path(__file__).parent / "mistakes"
 MODEL = '<mujoco><worldbody><body name="torso">{}<geom size="0.1"/></body></worldbody></mujoco>\n'
 SLIDES = '<joint type="slide"/><joint type="slide" axis="0 1 0"/><joint axis="0 1 0"/>'
-LISTS = {"envs": ", ".join(TASKS), "policies": ", ".join(zoo.names())}
+LISTS = {
+    "envs": ", ".join(TASKS),
+    "gymnasium_envs": ", ".join(GYMNASIUM_TASKS),
+    "policies": ", ".join(zoo.names()),
+}
 NAMES = {name: getattr(mjx_walk, name) for name in ("BraxEnv", "load_run", "make_env", "register_task", "run")}
 
 

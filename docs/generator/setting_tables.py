@@ -1,5 +1,8 @@
 """Tables of settings, from the dataclasses that declare them."""
 
+import dataclasses
+import itertools
+
 from generator.markdown import code, first_sentence, table
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
@@ -48,6 +51,24 @@ def group_table(name: str) -> str:
     return settings_table(*GROUPS[name])
 
 
+def task_tables(name: str) -> str:
+    """The settings of a task that others do not have, with those of its own groups."""
+    schema = TASKS[name][1]
+    common = {field.name for field in dataclasses.fields(TaskOptions)} - {"frame_skip"}
+    titles, rule, *rows = settings_table(schema, "env.").splitlines()
+    own = [row for row in rows if row.split("`")[1].removeprefix("env.") not in common]
+    groups = [settings_table(*group).splitlines()[2:] for group in own_groups(schema)]
+    return "\n".join([titles, rule, *own, *itertools.chain(*groups)])
+
+
+def own_groups(schema: type) -> list[tuple[type, str]]:
+    """The groups of settings of a task that others do not have, with the start of their full keys."""
+    common = {field.name for field in dataclasses.fields(TaskOptions)}
+    fields = [field for field in dataclasses.fields(schema) if field.name not in common]
+    kinds = {field.name: field.default_factory for field in fields if dataclasses.is_dataclass(field.default_factory)}
+    return [(kind, f"env.{name}.") for name, kind in kinds.items()]
+
+
 def algorithm_table(name: str) -> str:
     """The settings of an algorithm."""
     return settings_table(ALGORITHMS[name][1], "algo.")
@@ -69,4 +90,5 @@ def algorithms(pages: dict[str, str]) -> str:
 def all_schemas() -> list[type]:
     """Every dataclass of settings."""
     own = [schema for _, schema in (*TASKS.values(), *ALGORITHMS.values())]
-    return [*(schema for schema, _ in GROUPS.values()), *own]
+    groups = [group for _, schema in TASKS.values() for group, _ in own_groups(schema)]
+    return [*(schema for schema, _ in GROUPS.values()), *own, *groups]

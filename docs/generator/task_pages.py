@@ -10,7 +10,7 @@ from generator.observations import clipped_to, entries
 from generator.setting_tables import GROUPS, settings_table
 from generator.task_texts import TEXTS, TaskText
 from mjx_walk import zoo
-from mjx_walk.envs import TASKS, Task, make_env
+from mjx_walk.envs import GYMNASIUM_TASKS, TASKS, Task, make_env
 from mjx_walk.utils import setting_fields
 
 PAGES = Path(__file__).parents[1] / "tasks"
@@ -53,7 +53,7 @@ def versions(name: str) -> dict[str, Task]:
 def overview_of_all() -> str:
     """The table of all tasks."""
     rows = []
-    for name in TASKS:
+    for name in GYMNASIUM_TASKS:
         tasks = versions(name)
         task = tasks["v5"]
         sizes = (task.observation_size, task.action_size, f"{task.max_episode_steps:,}")

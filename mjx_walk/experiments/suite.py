@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mjx_walk.envs import BUILT_IN_TASKS
+from mjx_walk.envs import GYMNASIUM_TASKS
 from mjx_walk.experiments import planned_runs
 from mjx_walk.experiments.planned_runs import PlannedRun
 from mjx_walk.storage.files import refuse_links, user_path
@@ -10,7 +10,7 @@ from mjx_walk.utils.errors import UserError
 
 __all__ = ["REFERENCES", "SUITES", "normalize", "plan_suite"]
 
-SUITES = {"mujoco": tuple(BUILT_IN_TASKS)}
+SUITES = {"mujoco": GYMNASIUM_TASKS}
 """Environments of each suite."""
 
 REFERENCES = {

@@ -64,8 +64,11 @@ def make_gymnasium_env(options: TaskOptions, rendering: dict[str, object]) -> Mu
         rendering: values of `RENDER_KEYWORDS`.
 
     Raises:
-        UserError: `render_mode="human"` without a screen, with which Gymnasium ends the process.
+        UserError: Gymnasium has no equivalent, or `render_mode="human"` without a screen, with which Gymnasium ends the
+            process.
     """
+    if not TASKS[options.name][0].has_gymnasium_name():
+        raise UserError(f"Gymnasium has no equivalent of {options.name}; step it with mjx_walk.make_env")
     if rendering.get("render_mode") == "human" and not has_screen():
         raise UserError("render_mode='human' needs a screen; use render_mode='rgb_array'")
     spec = gymnasium.spec(TASKS[options.name][0].id_of(options))

@@ -12,12 +12,12 @@ import scipy.stats
 from gymnasium.envs.mujoco.humanoid_v5 import mass_center
 from helpers import OPTIMIZED
 
-from mjx_walk.envs import TASKS, make_env
+from mjx_walk.envs import GYMNASIUM_TASKS, TASKS, make_env
 from mjx_walk.envs.models import model_path
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.machine.quiet_mujoco import hide_deprecations
 
-VERSIONS = [(name, version) for name in TASKS for version in TASKS[name][0].XML_FILES]
+VERSIONS = [(name, version) for name in GYMNASIUM_TASKS for version in TASKS[name][0].XML_FILES]
 COMPUTED = ("sin", "cos", "to_target")
 """Blocks of observations that are computed from MuJoCo's arrays, so float32 rounds them more than once."""
 
@@ -107,7 +107,7 @@ def test_reset_observation(name, version):
         assert task.observation_blocks() == blocks
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", GYMNASIUM_TASKS)
 def test_resets_have_gymnasiums_distribution(name):
     """Each coordinate by itself, and the distances that Gymnasium's targets and objects must keep."""
     task = make_env(name, physics="c")

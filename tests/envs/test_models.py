@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import CLONE, TINY, train_here
 
-from mjx_walk.envs import TASKS, make_env
+from mjx_walk.envs import GYMNASIUM_TASKS, TASKS, make_env
 from mjx_walk.envs.models import load_model
 from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.utils.errors import UserError
@@ -181,10 +181,10 @@ def test_shaping_needs_the_coordinate_in_the_model(shaping, says):
 
 
 def test_the_view_fits_the_model():
-    assert all(make_env(name, physics="c").view == TASKS[name][0].VIEW for name in TASKS)
+    assert all(make_env(name, physics="c").view == TASKS[name][0].VIEW for name in GYMNASIUM_TASKS)
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", GYMNASIUM_TASKS)
 @pytest.mark.parametrize("inside", ["", "<worldbody/>", "<worldbody><geom size='1'/><site name='s'/></worldbody>"])
 def test_a_model_without_bodies_is_refused(tmp_path, name, inside):
     (tmp_path / "empty.xml").write_text(f"<mujoco>{inside}</mujoco>")

@@ -10,7 +10,7 @@ import pytest
 from helpers import OPTIMIZED, command_here, slow_except
 
 from mjx_walk import parity as parity_command
-from mjx_walk.envs import TASKS, make_env
+from mjx_walk.envs import GYMNASIUM_TASKS, make_env
 from mjx_walk.envs.physics import PhysicsState, make_engine, mjx_warp
 from mjx_walk.evaluation import engine_parity
 from mjx_walk.evaluation.random_steps import take_random_steps
@@ -34,7 +34,7 @@ def _new_memory_holds_no_zeros():
 
 FAST = [("humanoid", "v5", "warp"), ("half_cheetah", "v5", "jax")]
 """Both engines, both integrators."""
-EVERY = [(name, "v5", physics) for name in TASKS for physics in ("jax", "warp")]
+EVERY = [(name, "v5", physics) for name in GYMNASIUM_TASKS for physics in ("jax", "warp")]
 EVERY += [("walker2d", "v4", "warp")]
 """Every model; the older Walker2d's on Warp alone. The versions of the other tasks share theirs."""
 LONG = ("humanoid_standup", "v5", "jax")

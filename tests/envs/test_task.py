@@ -16,8 +16,9 @@ import pytest
 from shapes import check_shapes
 from toy_tasks import MountainCar
 
-from mjx_walk.envs import TASKS, TrainableTask, make_env
+from mjx_walk.envs import GYMNASIUM_TASKS, TASKS, TrainableTask, make_env
 from mjx_walk.envs.physics import base
+from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.episode import make_gymnasium
@@ -70,7 +71,7 @@ def test_nested_vmap_calls_a_batched_function_once():
     assert empty.shape == (3, 4, 0) and sizes[-1] == (12, 0)
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", GYMNASIUM_TASKS)
 def test_nonfinite_physics_terminates_and_is_not_returned(name):
     task = make_env(name, physics="c")
     good = task.reset(jax.random.PRNGKey(0))
@@ -112,7 +113,39 @@ def test_state_holds_no_derived_arrays():
     assert sum(x.size for x in jax.tree.leaves(state)) < task.observation_size + 100
 
 
-@pytest.mark.parametrize("name", TASKS)
+class Chaser(Walker2d):
+    """Walker2d that observes a target, which is drawn at the reset and moves by the first action in each step."""
+
+    def observation_blocks(self):
+        return super().observation_blocks() | {"target": 1}
+
+    def observe_all(self, physics, derived, carry):
+        return jnp.append(self.observe(physics, derived), carry["target"])
+
+    def initial_carry(self, key, physics, derived):
+        return {"target": jax.random.uniform(key)}
+
+    def next_carry(self, before, physics, derived, action):
+        return {"target": before.memory["target"] + action[0]}
+
+
+def test_a_carry_may_be_random_and_depend_on_the_former_one():
+    task, plain = Chaser(Walker2dOptions(name="walker2d"), "c"), make_env("walker2d", physics="c")
+    keys = jax.random.split(jax.random.PRNGKey(0), 5)
+    states, expected = jax.vmap(task.reset)(keys), jax.vmap(plain.reset)(keys)
+    np.testing.assert_array_equal(states.obs[:, :-1], expected.obs)
+    np.testing.assert_array_equal(states.obs[:, -1], states.memory["target"])
+    assert len(np.unique(states.memory["target"])) == 5
+    actions = jnp.full((5, 6), 0.25)
+    after = jax.vmap(task.step)(states, actions)
+    np.testing.assert_allclose(after.obs[:, -1], states.memory["target"] + 0.25, rtol=1e-6)
+    np.testing.assert_array_equal(after.reward, jax.vmap(plain.step)(expected, actions).reward)
+    qpos, qvel = states.physics.qpos[0], states.physics.qvel[0]
+    assert task.reset_to(qpos, qvel).obs[-1] == task.reset_to(qpos, qvel, key=jax.random.PRNGKey(0)).obs[-1]
+    assert task.reset_to(qpos, qvel).obs[-1] != task.reset_to(qpos, qvel, key=jax.random.PRNGKey(1)).obs[-1]
+
+
+@pytest.mark.parametrize("name", GYMNASIUM_TASKS)
 def test_shapes_equal_the_annotations(name, monkeypatch):
     methods = (
         "reset",
@@ -133,7 +166,7 @@ def test_shapes_equal_the_annotations(name, monkeypatch):
         task.reset_to(task.init_qpos.reshape(1, -1), task.init_qvel)
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", GYMNASIUM_TASKS)
 def test_actions_are_scaled_to_gymnasiums_units(name):
     task = make_env(name, physics="c")
     np.testing.assert_array_equal(task.scale_action(jnp.full(task.action_size, -2.0)), task.action_low)

@@ -12,11 +12,11 @@ import warp as wp
 from helpers import slow_except
 
 import mjx_walk
-from mjx_walk.envs import TASKS
+from mjx_walk.envs import GYMNASIUM_TASKS
 from mjx_walk.envs.physics import warp_kernels
 
 
-@pytest.mark.parametrize("name", slow_except(["inverted_pendulum", "humanoid"], TASKS))
+@pytest.mark.parametrize("name", slow_except(["inverted_pendulum", "humanoid"], GYMNASIUM_TASKS))
 def test_they_are_those_of_a_reset_and_a_step(name, monkeypatch):
     env = mjx_walk.make_env(name, physics="warp")
     foreseen = warp_kernels.launched_variants(env.engine._mj_model, env.engine._njmax)

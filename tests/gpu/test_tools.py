@@ -10,12 +10,12 @@ import pytest
 from gpu_gate import checked_rows, require, run, run_python
 
 from mjx_walk import zoo
-from mjx_walk.envs import TASKS
+from mjx_walk.envs import GYMNASIUM_TASKS
 from mjx_walk.storage.scores import read_scores
 
 pytestmark = pytest.mark.gpu
 
-PARITY = [("warp", name, "v5") for name in TASKS]
+PARITY = [("warp", name, "v5") for name in GYMNASIUM_TASKS]
 PARITY += [("warp", "walker2d", "v4"), ("jax", "inverted_pendulum", "v5"), ("jax", "walker2d", "v5")]
 
 OWN_TASK = """

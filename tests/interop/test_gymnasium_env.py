@@ -15,7 +15,7 @@ from gymnasium.wrappers import TimeLimit
 from helpers import ENVIRONMENT, renders
 from side_by_side import IDS, REGISTERED, assert_same, make_both, outcome
 
-from mjx_walk.envs import TASKS, make_env
+from mjx_walk.envs import GYMNASIUM_TASKS, TASKS, make_env
 from mjx_walk.envs.model_files import ASSETS
 from mjx_walk.interop import gymnasium_programs
 from mjx_walk.utils.errors import UserError
@@ -23,7 +23,7 @@ from mjx_walk.utils.errors import UserError
 
 def test_every_task_is_registered():
     specs = [gymnasium.spec(name) for name in REGISTERED]
-    assert {spec.kwargs["env"] for spec in specs} == TASKS.keys() and len(REGISTERED) == 2 * len(TASKS)
+    assert {spec.kwargs["env"] for spec in specs} == {*GYMNASIUM_TASKS} and len(REGISTERED) == 2 * len(GYMNASIUM_TASKS)
     for spec in specs:
         task, options = TASKS[spec.kwargs["env"]]
         assert (spec.name, spec.max_episode_steps) == (task.GYMNASIUM_NAME, options().max_episode_steps)

@@ -12,7 +12,7 @@ import yaml
 from mjx_walk import train as train_command
 from mjx_walk.algos import ALGORITHMS, make_algorithm
 from mjx_walk.api import make_task, resolve
-from mjx_walk.envs import TASKS
+from mjx_walk.envs import GYMNASIUM_TASKS
 from mjx_walk.experiments import planned_runs
 from mjx_walk.settings.config import CONFIG_DIR, flatten, load_config, recipe_names, training_command
 from mjx_walk.settings.recipes import HARDWARE, fallback
@@ -20,7 +20,7 @@ from mjx_walk.settings.saved_config import read_config, save_config
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import describe, has_effect
 
-RECIPES = [f"{size}/{env}_{algo}" for size in HARDWARE for env in TASKS for algo in ALGORITHMS]
+RECIPES = [f"{size}/{env}_{algo}" for size in HARDWARE for env in GYMNASIUM_TASKS for algo in ALGORITHMS]
 FOLDER = Path(CONFIG_DIR) / "recipe"
 FILES = sorted(str(path.relative_to(FOLDER).with_suffix("")) for path in FOLDER.glob("*/[!_]*.yaml"))
 
