@@ -21,6 +21,7 @@ __all__ = [
     "activation",
     "check_action_shape",
     "check_state_shape",
+    "first_state",
     "is_finite",
 ]
 
@@ -52,6 +53,22 @@ class State(flax.struct.PyTreeNode):
     """`[] i32`: steps since the reset."""
     metrics: dict[str, Array]
     """`[] f32` each: the reward terms under the names of Gymnasium's `info`, `nonfinite` and `overflow`."""
+
+
+def first_state(
+    physics: PhysicsState, memory: Carry, obs: Float[Array, " observation_size"], metric_names: tuple[str, ...]
+) -> State:
+    """The state at the start of an episode."""
+    return State(
+        physics=physics,
+        memory=memory,
+        obs=obs,
+        reward=jnp.zeros((), jnp.float32),
+        terminated=jnp.zeros((), bool),
+        truncated=jnp.zeros((), bool),
+        steps=jnp.zeros((), jnp.int32),
+        metrics={name: jnp.zeros((), jnp.float32) for name in metric_names},
+    )
 
 
 def check_action_shape(action: ArrayLike | Array, expected: tuple[int, ...]) -> None:

@@ -17,7 +17,16 @@ from mjx_walk.envs.motors import motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping, shaping_terms, term_names
-from mjx_walk.envs.state import Carry, State, TrainableTask, activation, check_action_shape, check_state_shape, is_finite
+from mjx_walk.envs.state import (
+    Carry,
+    State,
+    TrainableTask,
+    activation,
+    check_action_shape,
+    check_state_shape,
+    first_state,
+    is_finite,
+)
 from mjx_walk.envs.task_options import TaskOptions, check_version, with_absolute_paths
 from mjx_walk.envs.user_files import load_reward_function
 from mjx_walk.envs.view import View
@@ -222,16 +231,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         physics = PhysicsState(qpos, qvel, warmstart, activation(na, act))
         derived = self.engine.forward(physics)
         carry = self.initial_carry(jax.random.PRNGKey(0) if key is None else key, physics, derived)
-        return State(
-            physics=physics,
-            memory=carry | self._kept(derived),
-            obs=self.observe_all(physics, derived, carry),
-            reward=jnp.zeros((), jnp.float32),
-            terminated=jnp.zeros((), bool),
-            truncated=jnp.zeros((), bool),
-            steps=jnp.zeros((), jnp.int32),
-            metrics={name: jnp.zeros((), jnp.float32) for name in self.metric_names},
-        )
+        obs = self.observe_all(physics, derived, carry)
+        return first_state(physics, carry | self._kept(derived), obs, self.metric_names)
 
     @standard_dtypes()
     def step(self, state: State, action: Float[Array, " action_size"]) -> State:
