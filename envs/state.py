@@ -4,6 +4,7 @@ from typing import Protocol, runtime_checkable
 
 import flax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
@@ -18,11 +19,10 @@ __all__ = [
     "Carry",
     "State",
     "TrainableTask",
-    "activation",
     "check_action_shape",
-    "check_state_shape",
     "first_state",
     "is_finite",
+    "physics_state",
 ]
 
 NO_TIME_LIMIT = 2**31 - 1
@@ -81,25 +81,32 @@ def check_action_shape(action: ArrayLike | Array, expected: tuple[int, ...]) -> 
         raise ValueError(f"Action dimension mismatch. Expected {expected}, found {np.shape(action)}")
 
 
-def check_state_shape(**arrays: tuple[ArrayLike | Array | None, int]) -> None:
-    """Check positions and velocities before they are converted.
+def physics_state(
+    model: mujoco.MjModel,
+    qpos: Float[Array | np.ndarray, " nq"],
+    qvel: Float[Array | np.ndarray, " nv"],
+    warmstart: Float[Array | np.ndarray, " nv"] | None = None,
+    act: Float[Array | np.ndarray, " na"] | None = None,
+) -> PhysicsState:
+    """The physics state of a model at a position and velocity, in float32.
 
     Args:
-        arrays: each array by its name, and its number of elements. None is not checked.
+        model: the model.
+        qpos: m and rad.
+        qvel: m/s and rad/s.
+        warmstart: initial guess of the constraint solver, m/s² and rad/s². Default: zeros.
+        act: activations of actuators. Default: zeros, as after `mj_resetData`.
 
     Raises:
         UserError: an array has another shape.
     """
-    for name, (array, size) in arrays.items():
+    sizes = {"qpos": model.nq, "qvel": model.nv, "warmstart": model.nv, "act": model.na}
+    found = []
+    for (name, size), array in zip(sizes.items(), (qpos, qvel, warmstart, act), strict=True):
         if array is not None and np.shape(array) != (size,):
             raise UserError(f"{name} has the shape {np.shape(array)}; give ({size},), and use jax.vmap for a batch")
-
-
-def activation(size: int, act: Float[Array | np.ndarray, " na"] | None = None) -> Float[Array, " na"] | None:
-    """Activations of actuators, zeros by default as after `mj_resetData`. None in a model without them, `size` zero."""
-    if not size:
-        return None
-    return jnp.zeros(size, jnp.float32) if act is None else jnp.asarray(act, jnp.float32)
+        found.append(jnp.zeros(size, jnp.float32) if array is None else jnp.asarray(array, jnp.float32))
+    return PhysicsState(*found[:3], found[3] if model.na else None)
 
 
 def is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[Array, ""]:

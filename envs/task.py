@@ -17,16 +17,7 @@ from mjx_walk.envs.motors import motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping, shaping_terms, term_names
-from mjx_walk.envs.state import (
-    Carry,
-    State,
-    TrainableTask,
-    activation,
-    check_action_shape,
-    check_state_shape,
-    first_state,
-    is_finite,
-)
+from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape, first_state, is_finite, physics_state
 from mjx_walk.envs.task_options import TaskOptions, check_version, with_absolute_paths
 from mjx_walk.envs.user_files import load_reward_function
 from mjx_walk.envs.view import View
@@ -223,12 +214,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         Raises:
             UserError: another shape, or `model` has changed. A traced reset raises it while it is traced.
         """
-        nq, nv, na = self.model.nq, self.model.nv, self.model.na
-        check_state_shape(qpos=(qpos, nq), qvel=(qvel, nv), warmstart=(warmstart, nv), act=(act, na))
         self._snapshot.refuse_changes()
-        qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
-        warmstart = jnp.zeros_like(qvel) if warmstart is None else jnp.asarray(warmstart, jnp.float32)
-        physics = PhysicsState(qpos, qvel, warmstart, activation(na, act))
+        physics = physics_state(self.model, qpos, qvel, warmstart, act)
         derived = self.engine.forward(physics)
         carry = self.initial_carry(jax.random.PRNGKey(0) if key is None else key, physics, derived)
         obs = self.observe_all(physics, derived, carry)
@@ -297,7 +284,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     def _reward_term_names(self) -> tuple[str, ...]:
         """Names of all reward terms, found by tracing `reward_function` on an example step."""
         terms = dict.fromkeys(self.gymnasium_reward_terms, jnp.float32(0.0))
-        physics = PhysicsState(self.init_qpos, self.init_qvel, self.init_qvel, activation(self.model.na))
+        physics = physics_state(self.model, self.init_qpos, self.init_qvel)
         obs, action = jnp.zeros(self.observation_size), jnp.zeros(self.action_size)
         step = RewardStep(terms, jnp.float32(0.0), physics, physics, obs, action, jnp.zeros((), bool), self.dt)
         names, shaped = tuple(terms), shaping_terms(self.options.shaping, step, self._motor_dofs)

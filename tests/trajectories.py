@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from mjx_walk.envs.physics import PhysicsState, make_engine
-from mjx_walk.envs.state import activation
+from mjx_walk.envs.state import physics_state
 
 
 def visited_states(model: mujoco.MjModel, num_envs: int, num_steps: int) -> tuple[PhysicsState, jax.Array]:
@@ -18,9 +18,7 @@ def visited_states(model: mujoco.MjModel, num_envs: int, num_steps: int) -> tupl
     rng = np.random.default_rng(0)
     qpos = model.qpos0 + 0.02 * rng.normal(size=(num_envs, model.nq))
     qvel = 0.5 * rng.normal(size=(num_envs, model.nv))
-    act = activation(model.na)
-    act = None if act is None else jnp.tile(act, (num_envs, 1))
-    state = PhysicsState(jnp.float32(qpos), jnp.float32(qvel), jnp.zeros((num_envs, model.nv)), act)
+    state = jax.vmap(lambda *x: physics_state(model, *x))(qpos, qvel)
     step = jax.jit(jax.vmap(make_engine("c", model, 3, ()).step))
     states, controls = [], []
     for _ in range(num_steps):
