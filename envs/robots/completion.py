@@ -18,6 +18,8 @@ __all__ = ["Completed", "complete", "pose_within_ranges"]
 _LOGGER = logging.getLogger(__name__)
 _JNT = mujoco.mjtJoint
 _FLOOR = "floor"
+_FLOOR_SIZE = 20
+"""Half the edge of the drawn floor, m; each of its squares has an edge of 1 m."""
 _UNLIMITED = np.pi
 """Range of a servo whose joint has none, to both sides of its position in the first pose, rad."""
 
@@ -95,7 +97,7 @@ def _floors(model: mujoco.MjModel) -> Int[np.ndarray, " floors"]:
 
 
 def _add_floor(spec: mujoco.MjSpec) -> None:
-    """Add a plane, with a material and a light by which films show the speed."""
+    """Add a plane, and what films need: squares that show the speed, a light, and a sky if there is none."""
     taken = {geom.name for geom in spec.geoms} | {item.name for item in (*spec.materials, *spec.textures)}
     name = _FLOOR
     while name in taken:
@@ -109,11 +111,22 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
         width=300,
         height=300,
     )
-    material = spec.add_material(name=name, texrepeat=[5, 5], texuniform=True)
+    material = spec.add_material(name=name, texrepeat=[_FLOOR_SIZE, _FLOOR_SIZE])
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    size = [_FLOOR_SIZE, _FLOOR_SIZE, 0.05]
     spec.worldbody.add_geom(
-        name=name, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], contype=1, conaffinity=1, material=name
+        name=name, type=mujoco.mjtGeom.mjGEOM_PLANE, size=size, contype=1, conaffinity=1, material=name
     )
+    if not any(texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
+        spec.add_texture(
+            name=f"{name}_sky",
+            type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+            builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+            rgb1=[0.6, 0.75, 0.9],
+            rgb2=[0.95, 0.97, 1.0],
+            width=256,
+            height=256,
+        )
     spec.worldbody.add_light(pos=[0, 0, 3], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
