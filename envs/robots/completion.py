@@ -145,7 +145,7 @@ def _add_servos(spec: mujoco.MjSpec, model: mujoco.MjModel, motors: Motors) -> b
         target = spec.joints[joint]
         target.name = target.name or f"hinge_{joint}"
         servo = spec.add_actuator(name=f"{target.name}_servo", target=target.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        _make_servo(servo, one, _range(model, pose, int(joint)))
+        _make_servo(servo, target, one, _range(model, pose, int(joint)))
     _log("has no motors: added position servos to its hinges", joints, found)
     return True
 
@@ -158,7 +158,7 @@ def _replace_motors(spec: mujoco.MjSpec, model: mujoco.MjModel, motors: Motors) 
     pose = _first_pose(model)
     found = gains(model, pose, joints, limits, motors)
     for motor, joint, one in zip(replaced, joints, found, strict=True):
-        _make_servo(spec.actuators[motor], one, _range(model, pose, joint))
+        _make_servo(spec.actuators[motor], spec.joints[joint], one, _range(model, pose, int(joint)))
     if replaced:
         _log("has motors of torque: made position servos of them", joints, found)
     unlimited = [motor for motor in range(model.nu) if motor not in replaced and not model.actuator_ctrllimited[motor]]
@@ -169,7 +169,8 @@ def _replace_motors(spec: mujoco.MjSpec, model: mujoco.MjModel, motors: Motors) 
     return bool(replaced or unlimited)
 
 
-def _make_servo(servo: mujoco.MjsActuator, one: Gains, limits: tuple[float, float]) -> None:
+def _make_servo(servo: mujoco.MjsActuator, joint: mujoco.MjsJoint, one: Gains, limits: tuple[float, float]) -> None:
+    joint.armature = one.armature
     servo.gaintype, servo.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
     servo.dyntype = mujoco.mjtDyn.mjDYN_NONE
     servo.gainprm[:3] = one.kp, 0.0, 0.0
@@ -208,8 +209,9 @@ def _log(what: str, joints: Int[np.ndarray, " servos"], found: list[Gains]) -> N
     limits = [one.torque for one in found if one.torque]
     torque = f"at most {_span(limits)} N·m" if len(limits) == len(found) else "without torque limits"
     _LOGGER.info(
-        "The model %s (%d; kp %s N·m/rad, kd %s N·m·s/rad, %s); env.motors changes them",
-        *(what, len(joints), _span([one.kp for one in found]), _span([one.kd for one in found]), torque),
+        "The model %s (%d; kp %s N·m/rad, kd %s N·m·s/rad, armature %s kg·m², %s); env.motors changes them",
+        *(what, len(joints), _span([one.kp for one in found]), _span([one.kd for one in found])),
+        *(_span([one.armature for one in found]), torque),
     )
 
 
