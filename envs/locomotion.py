@@ -37,6 +37,8 @@ _CONTROL_SECONDS = 0.02
 """Duration of an environment step by default, s."""
 _CONTACT = 0.01
 """A foot touches the floor up to this height, relative to the height of the standing root."""
+_DISTANCE = 8.0
+"""Distance of the camera from the torso, relative to the height of the standing root."""
 
 
 @dataclasses.dataclass
@@ -94,14 +96,15 @@ class Locomotion(Task):
     REWARD_TERMS = {"v5": REWARD_TERMS}
     MISSING_VERSIONS = {"v4": "locomotion has no equivalent in Gymnasium, so it has no v4"}
     HEIGHT_INDEX = 2
-    VIEW = View(distance=3.0, elevation=-15.0)
+    VIEW = View(elevation=-15.0)
 
     options: LocomotionOptions
 
     def __init__(self, options: LocomotionOptions, physics: str = "auto", keep_info: bool = False):
         super().__init__(options, physics, keep_info)
         self.init_qpos = jnp.asarray(self.robot.standing, jnp.float32)
-        self.view = self.view._replace(body=self.robot.root)
+        height = float(self.robot.standing[2] - self.robot.floor)
+        self.view = self.view._replace(body=self.robot.root, distance=_DISTANCE * height)
 
     def load_model(self) -> mujoco.MjModel:
         self.robot = load_robot(self.model_file, self.options.motors, self.options.feet)

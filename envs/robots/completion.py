@@ -18,6 +18,8 @@ __all__ = ["Completed", "complete", "pose_within_ranges"]
 _LOGGER = logging.getLogger(__name__)
 _JNT = mujoco.mjtJoint
 _FLOOR = "floor"
+_FLOOR_SIZE = 20
+"""Half the edge of the drawn floor, m; each of its squares has an edge of 1 m."""
 _UNLIMITED = np.pi
 """Range of a servo whose joint has none, to both sides of its position in the first pose, rad."""
 
@@ -95,7 +97,7 @@ def _floors(model: mujoco.MjModel) -> Int[np.ndarray, " floors"]:
 
 
 def _add_floor(spec: mujoco.MjSpec) -> None:
-    """Add a plane, with a material and a light by which films show the speed."""
+    """Add a plane, and what films need: squares that show the speed, a light, and a sky if there is none."""
     taken = {geom.name for geom in spec.geoms} | {item.name for item in (*spec.materials, *spec.textures)}
     name = _FLOOR
     while name in taken:
@@ -109,11 +111,22 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
         width=300,
         height=300,
     )
-    material = spec.add_material(name=name, texrepeat=[5, 5], texuniform=True)
+    material = spec.add_material(name=name, texrepeat=[_FLOOR_SIZE, _FLOOR_SIZE])
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    size = [_FLOOR_SIZE, _FLOOR_SIZE, 0.05]
     spec.worldbody.add_geom(
-        name=name, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], contype=1, conaffinity=1, material=name
+        name=name, type=mujoco.mjtGeom.mjGEOM_PLANE, size=size, contype=1, conaffinity=1, material=name
     )
+    if not any(texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
+        spec.add_texture(
+            name=f"{name}_sky",
+            type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+            builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+            rgb1=[0.6, 0.75, 0.9],
+            rgb2=[0.95, 0.97, 1.0],
+            width=256,
+            height=256,
+        )
     spec.worldbody.add_light(pos=[0, 0, 3], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
@@ -132,7 +145,7 @@ def _add_servos(spec: mujoco.MjSpec, model: mujoco.MjModel, motors: Motors) -> b
         target = spec.joints[joint]
         target.name = target.name or f"hinge_{joint}"
         servo = spec.add_actuator(name=f"{target.name}_servo", target=target.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        _make_servo(servo, one, _range(model, pose, int(joint)))
+        _make_servo(servo, target, one, _range(model, pose, int(joint)))
     _log("has no motors: added position servos to its hinges", joints, found)
     return True
 
@@ -145,7 +158,7 @@ def _replace_motors(spec: mujoco.MjSpec, model: mujoco.MjModel, motors: Motors) 
     pose = _first_pose(model)
     found = gains(model, pose, joints, limits, motors)
     for motor, joint, one in zip(replaced, joints, found, strict=True):
-        _make_servo(spec.actuators[motor], one, _range(model, pose, joint))
+        _make_servo(spec.actuators[motor], spec.joints[joint], one, _range(model, pose, int(joint)))
     if replaced:
         _log("has motors of torque: made position servos of them", joints, found)
     unlimited = [motor for motor in range(model.nu) if motor not in replaced and not model.actuator_ctrllimited[motor]]
@@ -156,7 +169,8 @@ def _replace_motors(spec: mujoco.MjSpec, model: mujoco.MjModel, motors: Motors) 
     return bool(replaced or unlimited)
 
 
-def _make_servo(servo: mujoco.MjsActuator, one: Gains, limits: tuple[float, float]) -> None:
+def _make_servo(servo: mujoco.MjsActuator, joint: mujoco.MjsJoint, one: Gains, limits: tuple[float, float]) -> None:
+    joint.armature = one.armature
     servo.gaintype, servo.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
     servo.dyntype = mujoco.mjtDyn.mjDYN_NONE
     servo.gainprm[:3] = one.kp, 0.0, 0.0
@@ -195,8 +209,9 @@ def _log(what: str, joints: Int[np.ndarray, " servos"], found: list[Gains]) -> N
     limits = [one.torque for one in found if one.torque]
     torque = f"at most {_span(limits)} N·m" if len(limits) == len(found) else "without torque limits"
     _LOGGER.info(
-        "The model %s (%d; kp %s N·m/rad, kd %s N·m·s/rad, %s); env.motors changes them",
-        *(what, len(joints), _span([one.kp for one in found]), _span([one.kd for one in found]), torque),
+        "The model %s (%d; kp %s N·m/rad, kd %s N·m·s/rad, armature %s kg·m², %s); env.motors changes them",
+        *(what, len(joints), _span([one.kp for one in found]), _span([one.kd for one in found])),
+        *(_span([one.armature for one in found]), torque),
     )
 
 

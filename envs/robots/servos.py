@@ -21,6 +21,9 @@ _WEIGHT_ERROR = 0.2
 Playground's Go1, 35 N·m/rad, gives this error."""
 _DAMPING_RATIO = 0.5
 """Damping of a joint whose foot is in the air, relative to critical damping."""
+_NATURAL_FREQUENCY = 2 * np.pi * 10
+"""Of a servo with its rotor alone, rad/s, where the file has no armature. Source: mjlab's robots. Without an armature,
+light limbs such as wrists make the simulation unstable."""
 _MAX_DAMPING = 0.5
 """Largest part of a joint's velocity that the damping takes in one physics step. With 2, it oscillates."""
 
@@ -35,6 +38,8 @@ class Motors:
     """Torque for a velocity of 1 rad/s, N·m. Default: half of critical damping, by the inertia at the joint."""
     torque: float | None = setting(None, above=0)
     """Largest torque, N·m. Default: the file's limit; without one, torques are not limited."""
+    armature: float | None = setting(None, at_least=0)
+    """Inertia of the rotor at the joint, kg·m². Default: the file's; without one, for a natural frequency of 10 Hz."""
 
 
 class Gains(NamedTuple):
@@ -46,6 +51,8 @@ class Gains(NamedTuple):
     """N·m·s/rad."""
     torque: float | None
     """Largest torque, N·m. None: not limited."""
+    armature: float
+    """Inertia of the rotor at the joint, kg·m²."""
 
 
 def is_servo(model: mujoco.MjModel, motor: int) -> bool:
@@ -113,10 +120,13 @@ def gains(
         dof = model.jnt_dofadr[joint]
         torque = motors.torque or in_file
         kp = motors.kp or _torque_of_weight(model, qpos, joint) / _WEIGHT_ERROR
-        damping = 2 * _DAMPING_RATIO * np.sqrt(kp * fixed[dof]) - model.dof_damping[dof]
-        largest = _MAX_DAMPING * free[dof] / model.opt.timestep
-        kd = float(np.clip(damping, 0.0, largest)) if motors.kd is None else motors.kd
-        found.append(Gains(float(kp), kd, torque))
+        in_joint = float(model.dof_armature[dof])
+        armature = (in_joint or kp / _NATURAL_FREQUENCY**2) if motors.armature is None else motors.armature
+        added = armature - in_joint
+        damping = 2 * _DAMPING_RATIO * np.sqrt(kp * (fixed[dof] + added)) - model.dof_damping[dof]
+        largest = _MAX_DAMPING * (free[dof] + added) / model.opt.timestep
+        kd = float(np.clip(damping, 0.0, max(largest, 0.0))) if motors.kd is None else motors.kd
+        found.append(Gains(float(kp), kd, torque, float(armature)))
     return found
 
 

@@ -79,6 +79,14 @@ def test_gains_are_settings_and_grow_with_the_robot(tmp_path):
     assert (gains_of(large)[1] > 8 * kd).all()
 
 
+def test_joints_without_an_armature_get_that_of_a_servo_of_10_hz(tmp_path):
+    bare = loaded(tmp_path, joint="")
+    expected = gains_of(bare)[0] / (2 * np.pi * 10) ** 2
+    np.testing.assert_allclose(bare.model.dof_armature[bare.velocities], expected, rtol=1e-6)
+    assert (loaded(tmp_path).model.dof_armature[6:] == 0.005).all()  # the file's
+    assert (loaded(tmp_path, motors=Motors(armature=0.02)).model.dof_armature[6:] == 0.02).all()
+
+
 def test_servos_reach_their_targets_without_oscillating(tmp_path):
     """A quarter of a second after a step of 0.2 rad, with the robot hanging."""
     robot = loaded(tmp_path, joint='armature="0.005"')
