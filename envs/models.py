@@ -194,7 +194,18 @@ def check_model(model: mujoco.MjModel, task: str, needs: ModelNeeds) -> None:
     low, high = model.actuator_ctrlrange.T
     for i in np.flatnonzero(~(np.isfinite(low) & np.isfinite(high) & (low < high))):
         motor = model.actuator(int(i)).name or int(i)
-        raise UserError(f"motor '{motor}' of the model has no control range; set its ctrlrange=\"LOW HIGH\"")
+        inherited = ', or inheritrange="1"' if _is_servo_of_range(model, int(i)) else ""
+        raise UserError(f"motor '{motor}' of the model has no control range; set its ctrlrange=\"LOW HIGH\"{inherited}")
+
+
+def _is_servo_of_range(model: mujoco.MjModel, motor: int) -> bool:
+    """Whether a motor is a position servo whose joint or tendon has a range, which MuJoCo can take for the control."""
+    target, kind = model.actuator_trnid[motor, 0], model.actuator_trntype[motor]
+    is_limited = (kind == mujoco.mjtTrn.mjTRN_JOINT and model.jnt_limited[target]) or (
+        kind == mujoco.mjtTrn.mjTRN_TENDON and model.tendon_limited[target]
+    )
+    gain, bias = model.actuator_gainprm[motor, 0], model.actuator_biasprm[motor, 1]
+    return bool(is_limited and gain > 0 and gain == -bias)
 
 
 def check_pose(model: mujoco.MjModel, derived: Iterable[str]) -> None:

@@ -22,7 +22,6 @@ FOLDERS = {
     "dm_control": ("dm_control", "suite"),
 }
 EQUAL = "equals Gymnasium"
-STATE = "actuators with an activation state"
 MODELS = [
     ("Brax humanoid.xml", "humanoid", EQUAL),
     ("Brax ant.xml", "ant", EQUAL),
@@ -36,8 +35,8 @@ MODELS = [
     ("dm_control cheetah.xml", "half_cheetah", EQUAL),
     ("dm_control hopper.xml", "hopper", EQUAL),
     ("dm_control swimmer.xml", "swimmer", "this one has no <actuator>"),
-    ("dm_control quadruped.xml", "ant", STATE),
-    ("dm_control dog.xml", "ant", STATE),
+    ("dm_control quadruped.xml", "ant", EQUAL),
+    ("dm_control dog.xml", "ant", EQUAL),
     ("Gymnasium ant.xml", "walker2d", EQUAL),
     ("Gymnasium humanoid.xml", "ant", EQUAL),
     ("Gymnasium point.xml", "ant", EQUAL),
@@ -165,8 +164,19 @@ def edited(tmp_path, old, new):
 def test_motors_without_a_range_are_refused(tmp_path):
     source = 'ctrllimited="true" ctrlrange="-1.0 1.0" gear="100" joint="leg_joint"'
     path = edited(tmp_path, source, 'gear="100" name="shin" joint="leg_joint"')
-    with pytest.raises(UserError, match="motor 'shin' of the model has no control range; set its ctrlrange"):
+    with pytest.raises(UserError, match="motor 'shin' of the model has no control range; set its ctrlrange.*HIGH\"$"):
         make_env("walker2d", physics="c", xml_file=path)
+
+
+def test_servos_may_take_the_range_of_their_joint(tmp_path):
+    """MuJoCo gives a position servo its joint's range with `inheritrange`, as the error for one without a range says."""
+    source = '<motor ctrllimited="true" ctrlrange="-1.0 1.0" gear="100" joint="leg_joint"/>'
+    servo = '<position name="shin" kp="50" dampratio="1" joint="leg_joint" {}/>'
+    with pytest.raises(UserError, match='set its ctrlrange="LOW HIGH", or inheritrange="1"$'):
+        make_env("walker2d", physics="c", xml_file=edited(tmp_path, source, servo.format('ctrllimited="false"')))
+    task = make_env("walker2d", physics="c", xml_file=edited(tmp_path, source, servo.format('inheritrange="1"')))
+    knee = task.model.joint("leg_joint")
+    np.testing.assert_allclose((task.action_low[1], task.action_high[1]), knee.range, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
