@@ -106,7 +106,8 @@ def physics_state(
         if array is not None and np.shape(array) != (size,):
             raise UserError(f"{name} has the shape {np.shape(array)}; give ({size},), and use jax.vmap for a batch")
         found.append(jnp.zeros(size, jnp.float32) if array is None else jnp.asarray(array, jnp.float32))
-    return PhysicsState(*found[:3], found[3] if model.na else None)
+    position, velocity, guess, activation = found
+    return PhysicsState(position, velocity, guess, activation if model.na else None)
 
 
 def is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[Array, ""]:

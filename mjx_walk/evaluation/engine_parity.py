@@ -117,7 +117,7 @@ def compare(task: Task, expected: State, found: State) -> Parity:
         _error("qpos", expected.physics.qpos, found.physics.qpos, is_relative=False),
         _error("qvel", expected.physics.qvel, found.physics.qvel, is_relative=False),
     ]
-    if expected.physics.act is not None:
+    if expected.physics.act is not None and found.physics.act is not None:
         errors.append(_error("act", expected.physics.act, found.physics.act))
     start = 0
     for name, size in task.observation_blocks().items():

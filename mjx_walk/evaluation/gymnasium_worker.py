@@ -33,6 +33,7 @@ def serve() -> None:
     os.dup2(_STDERR, _STDOUT)
     warnings.simplefilter("ignore", DeprecationWarning)  # the user chose v4
     import gymnasium
+    from gymnasium.envs.mujoco import MujocoEnv
 
     from mjx_walk.evaluation.perturbations import Perturbation, perturb
     from mjx_walk.machine.quiet_mujoco import hide_deprecations, write_no_log
@@ -43,7 +44,9 @@ def serve() -> None:
     with hide_deprecations():
         envs = [gymnasium.make(name, **keywords) for _ in episodes]
     for env, (seed, changes) in zip(envs, episodes, strict=True):
-        perturb(env.unwrapped, Perturbation(*changes), seed)
+        mujoco_env = env.unwrapped
+        assert isinstance(mujoco_env, MujocoEnv)
+        perturb(mujoco_env, Perturbation(*changes), seed)
     obs = np.stack([env.reset(seed=seed)[0] for env, (seed, _) in zip(envs, episodes, strict=True)])
     is_over = np.zeros(len(envs), bool)
     send(answers, obs)

@@ -2,14 +2,12 @@
 
 import feature_models
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from helpers import slow_except
 
 from mjx_walk.envs.physics import PhysicsState, make_engine
-from mjx_walk.envs.state import activation
 
 NUM_SUBSTEPS = 5
 MOTORS = ("filter_affine", "filterexact_actrange", "integrator_servo", "muscle", "servo_forcerange", "tendon_servo")
