@@ -263,7 +263,8 @@ MOTORS = {
         "actuator": '<position joint="arm" kp="50" kv="2" ctrlrange="-1 1"/>',
     },
     "tendon_servo": {
-        "tendon": ACROSS.format(""), "actuator": '<position tendon="across" kp="5" kv="3" ctrlrange="0 1"/>'
+        "tendon": ACROSS.format(""),
+        "actuator": '<position tendon="across" kp="5" kv="3" ctrlrange="0 1"/>',
     },
     "tendon_servo_range": {
         "tendon": FIXED.format('actuatorfrcrange="-.2 .2"'),

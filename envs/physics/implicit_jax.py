@@ -1,7 +1,7 @@
 """Acceleration of MuJoCo's `implicitfast` integrator for the `jax` engine.
 
-Source: `mj_implicitSkip`, `mjd_smooth_vel` and `mjd_actuator_vel` of MuJoCo. MJX 3.17 has them, with differences from C:
-it keeps derivatives of clamped forces and those between branches, and leaves out muscles and the rotation of free bodies.
+Source: `mj_implicitSkip`, `mjd_smooth_vel` and `mjd_actuator_vel` of MuJoCo. MJX 3.17's `implicit` differs from C. It
+keeps derivatives of clamped forces and those between branches, and leaves out muscles and the rotation of free bodies.
 """
 
 import jax
@@ -11,7 +11,6 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 from mujoco import mjx
-from mujoco.mjx._src import math as mjx_math
 from mujoco.mjx._src import support as mjx_support
 from mujoco.mjx._src.types import BiasType, DisableBit, DynType, GainType
 
@@ -92,9 +91,7 @@ def _free_dofs(model: mjx.Model) -> list[int]:
     return [int(dof) for dof in free if np.sum(model.dof_treeid == model.dof_treeid[dof]) == 6]
 
 
-def _free_body_metric(
-    model: mjx.Model, data: mjx.Data, dof: int, mass: Float[Array, "6 6"]
-) -> Float[Array, "6 6"]:
+def _free_body_metric(model: mjx.Model, data: mjx.Data, dof: int, mass: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
     """Mass matrix of a free body less the derivative of its forces: damping, and the gyroscopic ones of its rotation.
 
     Source: `free_bias_vel_blocks` of MuJoCo Warp.

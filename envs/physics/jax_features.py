@@ -75,9 +75,7 @@ def _mesh_margins(model: mujoco.MjModel) -> Iterator[str]:
         yield names_of_pair(model, both)
 
 
-@JAX_FEATURES.entry(
-    _JAX, None, "elliptic contacts without friction", 'set condim="3", or cone="pyramidal" in <option>'
-)
+@JAX_FEATURES.entry(_JAX, None, "elliptic contacts without friction", 'set condim="3", or cone="pyramidal" in <option>')
 def _elliptic_without_friction(model: mujoco.MjModel) -> Iterator[str]:
     """Contacts of dimension one in a model with elliptic cones."""
     if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:

@@ -1,8 +1,8 @@
 """Elements that an engine does not simulate. A model with one is refused before compilation, by the element's name.
 
 MuJoCo's complete state is `mjSTATE_INTEGRATION`. `PhysicsState` carries position, velocity, the solver's initial guess
-and activations. Mocap bodies and equality flags never change during an episode, so they need not be carried. The rest is
-refused on every engine. MJX silently ignores further features; those are refused on its engines.
+and activations. Mocap bodies and equality flags never change during an episode, so they need not be carried. The rest
+is refused on every engine. MJX silently ignores further features; those are refused on its engines.
 """
 
 from collections.abc import Iterator

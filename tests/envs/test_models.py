@@ -164,15 +164,15 @@ def edited(tmp_path, old, new):
 def test_motors_without_a_range_are_refused(tmp_path):
     source = 'ctrllimited="true" ctrlrange="-1.0 1.0" gear="100" joint="leg_joint"'
     path = edited(tmp_path, source, 'gear="100" name="shin" joint="leg_joint"')
-    with pytest.raises(UserError, match="motor 'shin' of the model has no control range; set its ctrlrange.*HIGH\"$"):
+    with pytest.raises(UserError, match=r"motor 'shin' of the model has no control range; set its ctrlrange.*HIGH\"$"):
         make_env("walker2d", physics="c", xml_file=path)
 
 
 def test_servos_may_take_the_range_of_their_joint(tmp_path):
-    """MuJoCo gives a position servo its joint's range with `inheritrange`, as the error for one without a range says."""
+    """The error for a position servo without a range names `inheritrange`, which gives it its joint's range."""
     source = '<motor ctrllimited="true" ctrlrange="-1.0 1.0" gear="100" joint="leg_joint"/>'
     servo = '<position name="shin" kp="50" dampratio="1" joint="leg_joint" {}/>'
-    with pytest.raises(UserError, match='set its ctrlrange="LOW HIGH", or inheritrange="1"$'):
+    with pytest.raises(UserError, match=r'set its ctrlrange="LOW HIGH", or inheritrange="1"$'):
         make_env("walker2d", physics="c", xml_file=edited(tmp_path, source, servo.format('ctrllimited="false"')))
     task = make_env("walker2d", physics="c", xml_file=edited(tmp_path, source, servo.format('inheritrange="1"')))
     knee = task.model.joint("leg_joint")

@@ -71,13 +71,21 @@ REFUSED = {
         {"motor": GENERAL.format('dyntype="user" actdim="1"')},
         "user dynamics of an activation (motor 'm')",
     ),
-    "actearly": (JAX, {"motor": GENERAL.format('dyntype="filter" dynprm=".05" actearly="true"')}, "actearly (motor 'm')"),
+    "actearly": (
+        JAX,
+        {"motor": GENERAL.format('dyntype="filter" dynprm=".05" actearly="true"')},
+        "actearly (motor 'm')",
+    ),
     "dcmotor": (
         JAX,
         {"motor": '<dcmotor name="m" joint="knee" motorconst=".05" resistance="1" ctrlrange="-1 1"/>'},
         "direct-current motors and orientation servos (motor 'm')",
     ),
-    "pid": (MJX, {"motor": '<pid name="m" joint="knee" kp="5" ki="1" ctrlrange="-1 1"/>'}, "PID controllers (motor 'm')"),
+    "pid": (
+        MJX,
+        {"motor": '<pid name="m" joint="knee" kp="5" ki="1" ctrlrange="-1 1"/>'},
+        "PID controllers (motor 'm')",
+    ),
     "filterexact_rk4": (
         WARP,
         {"option": 'integrator="RK4"', "motor": GENERAL.format('dyntype="filterexact" dynprm=".05"')},
@@ -95,11 +103,15 @@ REFUSED = {
         "sensors with a history (sensor 's')",
     ),
     "sleep": (ALL, {"flag": '<flag sleep="enable"/>'}, 'sleeping bodies (<flag sleep="enable"/>)'),
-    "discrete": (ALL, {"option": 'integrator="discrete"'}, 'this integrator (integrator="discrete"); set integrator to'),
+    "discrete": (
+        ALL,
+        {"option": 'integrator="discrete"'},
+        'this integrator (integrator="discrete"); set integrator to',
+    ),
     "implicit": (
         MJX,
         {"option": 'integrator="implicit"'},
-        'this integrator (integrator="implicit"); set integrator to implicitfast, Euler or RK4 in <option>, or use physics=c',
+        'this integrator (integrator="implicit"); set integrator to implicitfast, Euler or RK4',
     ),
     "group": (
         MJX,
