@@ -39,7 +39,7 @@ MODELS: dict[str, Callable[[], mujoco.MjModel]] = {
     "implicit": lambda: rich("implicit", motor=ACTIVATION),
     "implicitfast": lambda: rich("implicitfast", motor=ACTIVATION),
     "activation": lambda: rich(motor=ACTIVATION, sensor=FORCE_SENSORS),
-    "activation_rk4": lambda: rich("RK4", motor=ACTIVATION),
+    "activation_rk4": lambda: rich("RK4", motor=ACTIVATION.replace("filterexact", "filter")),
     "elliptic": lambda: rich(option='cone="elliptic" impratio="5"'),
     "fluid": lambda: rich(option='density="500" viscosity=".5" wind="1 0 0"'),
     "no_gravity": lambda: rich(flag='gravity="disable"'),

@@ -89,9 +89,9 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
 
 def _make_mjx_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Engine:
     from mjx_walk.machine import quiet_mjx  # noqa: F401  # isort: skip
-    from mjx_walk.envs.physics.mjx_model import MIN_SOLVER_ITERATIONS
+    from mjx_walk.envs.physics.mjx_model import solver_iterations
 
-    warn_of_approximations(model, name, MIN_SOLVER_ITERATIONS)
+    warn_of_approximations(model, name, solver_iterations(model))
     if name == "warp":
         from mjx_walk.envs.physics.mjx_warp import WarpEngine
 

@@ -24,9 +24,10 @@ _AS_IN_MUJOCO = {
 """Pairs of geoms whose contacts the `jax` engine finds as MuJoCo does. For others it finds other points.
 
 Errors of velocities after a physics step, in 48 states of one falling body on one fixed geom, relative to one plus
-their change (90% of the states, largest): plane and mesh of 100 vertices 2.7e-2, 2.0e-1; capsule and mesh 6.7e-2,
-1.8e-1; box and mesh 1.5e-2, 2.0e-1; two meshes 2.4e-2, 8.3e-2; sphere and mesh 1.5e-5, 6.6e-5. On a height field:
-sphere 6.9e-7, 1.2e-3; capsule 3.6e-3, 5.5e-2; box 1.8e-1, 4.9e-1; mesh 1.5e-1, 2.9e-1."""
+their change (90% of the states, largest): plane and mesh 2.7e-2, 2.0e-1; capsule and mesh 6.7e-2, 1.8e-1; box and mesh
+1.5e-2, 2.0e-1; two meshes 2.4e-2, 8.3e-2; sphere and mesh 1.5e-5, 6.6e-5. On a height field: sphere 6.9e-7, 1.2e-3;
+capsule 3.6e-3, 5.5e-2; box 1.8e-1, 4.9e-1; mesh 1.5e-1, 2.9e-1. Warp's are at most 3.6e-5 for meshes and 5.3e-4, 1.5e-3
+for spheres on height fields."""
 
 
 def warn_of_approximations(model: mujoco.MjModel, engine: str, enough_iterations: int) -> None:

@@ -105,6 +105,8 @@ def _reasons(model: mujoco.MjModel, engine: str, name: str) -> Iterator[str]:
                 yield f"physics=warp gives the contacts of {sensor} in no fixed order; set its reduce, or use physics=c"
     if name in _SENSOR_ARRAYS and model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         yield 'MJX computes sensors at another stage of RK4 than MuJoCo; use integrator="Euler" or physics=c'
+    if name == "act_dot" and engine == "warp" and model.na and model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        yield "physics=warp returns another 'act_dot' than MuJoCo with RK4; use physics=jax or c"
     is_late = name in LATE_ARRAYS or (name == "sensordata" and fills_late_arrays(model))
     if engine == "jax" and is_late and model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT:
         yield f"physics=jax does not compute '{name}' without constraints; remove the flag, or use physics=warp or c"

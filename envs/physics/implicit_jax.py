@@ -1,8 +1,7 @@
 """Acceleration of MuJoCo's `implicitfast` integrator for the `jax` engine.
 
-Source: `mj_implicitSkip`, `mjd_smooth_vel` and `mjd_actuator_vel` of MuJoCo. MJX 3.17 has them, with differences from
-C: it keeps derivatives of clamped forces and those between branches, and leaves out muscles and the rotation of free
-bodies.
+Source: `mj_implicitSkip`, `mjd_smooth_vel` and `mjd_actuator_vel` of MuJoCo. MJX 3.17's `implicit` differs from C. It
+keeps derivatives of clamped forces and those between branches, and leaves out muscles and the rotation of free bodies.
 """
 
 import jax

@@ -120,14 +120,9 @@ def _runge_kutta_4(model: mjx.Model, start: mjx.Data) -> mjx.Data:
         velocity = start.qvel + step * data.qacc * dt
         act = data.act if act_dot_sum is None else start.act + step * dt * data.act_dot
         data = _forward(model, data.replace(qpos=qpos, qvel=velocity, act=act))
+        velocity_sum, acceleration_sum = velocity_sum + weight * velocity, acceleration_sum + weight * data.qacc
         act_dot_sum = None if act_dot_sum is None else act_dot_sum + weight * data.act_dot
-        return (
-            data,
-            velocity,
-            velocity_sum + weight * velocity,
-            acceleration_sum + weight * data.qacc,
-            act_dot_sum,
-        ), None
+        return (data, velocity, velocity_sum, acceleration_sum, act_dot_sum), None
 
     zeros = jnp.zeros_like(start.qvel)
     table = (jnp.array(_RK4_STEP, dt.dtype), jnp.array(_RK4_WEIGHT, dt.dtype))

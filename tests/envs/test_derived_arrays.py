@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 from derived_arrays import MODELS, TOLERANCE, accepted, array_names, errors, reference_cases
+from helpers import slow_except
 from mujoco.mjx._src import smooth as mjx_smooth
 from rich_model import sensors
 
@@ -127,6 +128,7 @@ def test_an_array_is_accepted_or_refused_in_one_line(engine):
         ),
         ("jax", "spatial_tendon", "cfrc_ext", "physics=jax leaves the forces of spatial tendons out of 'cfrc_ext'"),
         ("jax", "subtree_sensors_rk4", "subtree_linvel", "MJX computes sensors at another stage of RK4"),
+        ("warp", "activation_rk4", "act_dot", "physics=warp returns another 'act_dot' than MuJoCo with RK4"),
         ("warp", "force_sensors_rk4", "sensordata", "MJX computes sensors at another stage of RK4"),
     ],
 )
@@ -175,3 +177,25 @@ def test_warp_refuses_contact_sensors_whose_order_is_left_to_chance():
         read("warp", "none", "found force")
     for reduce, data in (("none", "found"), ("maxforce", "force"), ("netforce", "force")):
         read("warp", reduce, data)
+
+
+ACTIVATED = PENDULUM.replace(
+    "</actuator>",
+    '<general name="joint" joint="joint" dyntype="filter" dynprm=".05" ctrlrange="-1 1"/>'
+    '<general joint="joint" dyntype="integrator" gaintype="affine" gainprm="1 0 -.5" ctrlrange="-1 1"/></actuator>',
+)
+ACTIVATION_CASES = ["c implicit", "c implicitfast", "c RK4", "jax RK4", "warp implicitfast"]
+MOMENT_ARRAYS = ("qpos", "qacc", "act", "act_dot", "actuator_force", "qfrc_actuator", "cvel", "cacc", "sensordata")
+"""Arrays that tell the start of the last substep from its end, or from another stage."""
+
+
+@pytest.mark.parametrize("case", slow_except(["c implicit", "c RK4"], ACTIVATION_CASES))
+def test_arrays_with_activations_equal_mujocos(case):
+    engine, integrator = case.split()
+    sensor = '<actuatorfrc actuator="joint"/><accelerometer site="tip"/>'
+    model = mujoco.MjModel.from_xml_string(ACTIVATED.format(option=f'integrator="{integrator}"', sensor=sensor))
+    names = [name for name in MOMENT_ARRAYS if case != "jax RK4" or name != "sensordata"]  # refused
+    cases = reference_cases(model)
+    assert all(np.abs(case.step["act"]).min() > 0 and np.abs(case.step["act_dot"]).min() > 0 for case in cases)
+    found = errors(model, engine, tuple(names), cases)
+    assert {name: error for name, error in found.items() if max(error) > TOLERANCE[engine]} == {}

@@ -56,12 +56,11 @@ def assert_equal_steps(model, engine):
 
 CASES = [
     *(f"c {integrator}" for integrator in ("implicit", "implicitfast", "Euler", "RK4")),
-    *(f"{engine} {integrator}" for engine in ("jax", "warp") for integrator in ("implicitfast", "Euler", "RK4")),
+    *("jax implicitfast", "jax RK4", "warp implicitfast"),
 ]
 
 
 @pytest.mark.parametrize("case", slow_except(["c implicit", "jax implicitfast"], CASES))
 def test_a_step_equals_mujocos(case):
     engine, integrator = case.split()
-    features = [name for name in FEATURES if case != "warp RK4" or not name.startswith("filterexact")]  # refused
-    assert_equal_steps(feature_models.load(*features, option=f'integrator="{integrator}"'), engine)
+    assert_equal_steps(feature_models.load(*FEATURES, option=f'integrator="{integrator}"'), engine)

@@ -169,7 +169,7 @@ def test_motors_without_a_range_are_refused(tmp_path):
 
 
 def test_servos_may_take_the_range_of_their_joint(tmp_path):
-    """MuJoCo gives a position servo its joint's range with `inheritrange`, as the error of one without a range says."""
+    """The error for a position servo without a range names `inheritrange`, which gives it its joint's range."""
     source = '<motor ctrllimited="true" ctrlrange="-1.0 1.0" gear="100" joint="leg_joint"/>'
     servo = '<position name="shin" kp="50" dampratio="1" joint="leg_joint" {}/>'
     with pytest.raises(UserError, match=r'set its ctrlrange="LOW HIGH", or inheritrange="1"$'):

@@ -111,8 +111,7 @@ REFUSED = {
     "implicit": (
         MJX,
         {"option": 'integrator="implicit"'},
-        'this integrator (integrator="implicit"); set integrator to implicitfast, Euler or RK4 in <option>, or use '
-        "physics=c",
+        'this integrator (integrator="implicit"); set integrator to implicitfast, Euler or RK4',
     ),
     "group": (
         MJX,
