@@ -11,6 +11,7 @@ from trajectories import visited_states
 from mjx_walk.envs.physics import PhysicsState, make_engine, static_pairs
 from mjx_walk.envs.physics.approximations import warn_of_approximations
 from mjx_walk.envs.physics.jax_model import adapt_model
+from mjx_walk.envs.physics.mjx_model import solver_iterations
 from mjx_walk.envs.physics.static_pairs import drop_static_pairs
 from mjx_walk.utils.errors import UserError
 
@@ -63,6 +64,15 @@ CAPSULES = """
 </mujoco>
 """
 TETRAHEDRON = '<mesh name="tetrahedron" vertex="0 0 0 .2 0 0 0 .2 0 0 0 .2"/>'
+HEIGHT_FIELD = """
+<mujoco>
+  <asset><hfield name="h" nrow="2" ncol="2" size="1 1 .1 .1" elevation="0 1 0 .5"/></asset>
+  <worldbody>
+    <geom type="hfield" hfield="h"/>
+    <body pos="0 0 .3"><freejoint/><geom type="{}" size=".1 .1 .1"/></body>
+  </worldbody>
+</mujoco>
+"""
 ALL, MJX, JAX, WARP = ("c", "jax", "warp"), ("jax", "warp"), ("jax",), ("warp",)
 
 REFUSED = {
@@ -337,6 +347,27 @@ def test_capsules_that_stay_parallel_are_warned_of(end, contact, is_warned_of, c
     """MuJoCo has two contacts between them, the `jax` engine one."""
     warn_of_approximations(mujoco.MjModel.from_xml_string(CAPSULES.format(contact, end)), "jax", 0)
     assert ("between capsule '0' and capsule '1'; physics=warp" in caplog.text) == is_warned_of
+
+
+@pytest.mark.parametrize(
+    ("kind", "warned"), [("sphere", ()), ("capsule", ("jax",)), ("box", ("jax", "warp")), ("cylinder", ("warp",))]
+)
+def test_contacts_on_a_height_field_are_as_in_mujoco_or_warned_of(kind, warned, caplog):
+    model = mujoco.MjModel.from_xml_string(HEIGHT_FIELD.format(kind))
+    for engine in ("jax", "warp") if kind != "cylinder" else ("warp",):  # jax refuses cylinders
+        caplog.clear()
+        warn_of_approximations(model, engine, 0)
+        says = f"physics={engine} finds other contact points than MuJoCo between hfield '0' and {kind} '1'"
+        assert (says in caplog.text) == (engine in warned)
+
+
+def test_the_solver_has_more_iterations_for_many_pairs_of_geoms():
+    """Robots with many pairs need them; Humanoid with 126 pairs and smaller models do not."""
+    body = '<body pos="{0} 0 0"><freejoint/><geom size=".1"/></body>'
+    for num_bodies, expected in ((2, 8), (16, 8), (17, 16)):
+        bodies = "".join(body.format(i) for i in range(num_bodies))
+        model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+        assert solver_iterations(model) == expected
 
 
 def test_contacts_between_bodies_that_cannot_move_are_dropped():
