@@ -101,6 +101,14 @@ REFUSED = {
         {"option": 'integrator="RK4"', "motor": GENERAL.format('dyntype="filterexact" dynprm=".05"')},
         "filterexact and inductance with RK4 (motor 'm'); set integrator=",
     ),
+    **{
+        f"implicitfast_no_{name}": (
+            WARP,
+            {"option": 'integrator="implicitfast"', "flag": f'<flag {name}="disable"/>'},
+            f'implicitfast with this flag (<flag {name}="disable"/>); remove the flag',
+        )
+        for name in ("damper", "actuation")
+    },
     "implicitfast_in_water": (
         JAX,
         {"option": 'integrator="implicitfast" density="1000"'},
