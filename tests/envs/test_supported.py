@@ -369,13 +369,26 @@ def test_contacts_on_a_height_field_are_as_in_mujoco_or_warned_of(kind, warned, 
         assert (says in caplog.text) == (engine in warned)
 
 
-def test_the_solver_has_more_iterations_for_many_pairs_of_geoms():
-    """Robots with many pairs need them; Humanoid with 126 pairs and smaller models do not."""
+def test_the_solver_has_more_iterations_for_elliptic_cones_and_many_pairs_of_geoms():
+    """Robots need them; Humanoid with 126 pairs and smaller models do not."""
     body = '<body pos="{0} 0 0"><freejoint/><geom size=".1"/></body>'
-    for num_bodies, expected in ((2, 8), (16, 8), (17, 16)):
+    for cone, num_bodies, expected in (("pyramidal", 16, 8), ("pyramidal", 17, 16), ("elliptic", 2, 16)):
         bodies = "".join(body.format(i) for i in range(num_bodies))
-        model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
-        assert solver_iterations(model) == expected
+        text = f'<mujoco><option cone="{cone}"/><worldbody>{bodies}</worldbody></mujoco>'
+        assert solver_iterations(mujoco.MjModel.from_xml_string(text)) == expected
+
+
+@pytest.mark.parametrize(("engine", "is_warned_of"), [("jax", True), ("warp", False)])
+def test_detailed_meshes_compile_slowly_on_jax(engine, is_warned_of, caplog):
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    body = '<body pos="{0} 0 0"><freejoint/><geom type="mesh" mesh="stone"/></body>'
+    for attribute, says in (("", is_warned_of), ('maxhullvert="32"', False)):
+        mesh = f'<mesh name="stone" vertex="{" ".join(map(str, points.ravel()))}" {attribute}/>'
+        text = f"<mujoco><asset>{mesh}</asset><worldbody>{body.format(0)}{body.format(3)}</worldbody></mujoco>"
+        caplog.clear()
+        warn_of_approximations(mujoco.MjModel.from_xml_string(text), engine, 0)
+        assert ("slowly for mesh 'stone' with 100 vertices; set its maxhullvert=\"32\"" in caplog.text) == says
 
 
 def test_contacts_between_bodies_that_cannot_move_are_dropped():
