@@ -34,8 +34,8 @@ The same errors: box 3.1e-3, 6.3; cylinder 2.6e-3, 2.7e-2. Others: height field 
 and mesh 1.2e-3, 1.3e-2; meshes without a height field at most 3.6e-5."""
 
 _MANY_VERTICES = 64
-"""On two busy cores, MJX's step of Spot compiled in 4 minutes with at most 32 vertices a mesh. With the file's own hulls,
-of up to 216, it had not compiled after 12 minutes."""
+"""On two busy cores, MJX's step of Spot compiled in 4 minutes with at most 32 vertices a mesh. With the own hulls
+of the file, of up to 216, it had not compiled after 12 minutes."""
 
 
 def warn_of_approximations(model: mujoco.MjModel, engine: str, enough_iterations: int) -> None:
@@ -67,7 +67,7 @@ def warn_of_approximations(model: mujoco.MjModel, engine: str, enough_iterations
     mesh = next(_detailed_meshes(model), None) if engine == "jax" else None
     if mesh is not None:
         _LOGGER.warning(
-            "physics=jax compiles slowly for mesh '%s' with %d vertices; set its maxhullvert=\"32\" or use physics=warp",
+            "physics=jax compiles slowly for mesh '%s' with %d vertices; set its maxhullvert=\"32\", or physics=warp",
             model.mesh(mesh).name or mesh,
             _hull_vertices(model, mesh),
         )
