@@ -163,7 +163,7 @@ def let_solver_converge() -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--engines", nargs="+", default=["jax", "warp"])
-    parser.add_argument("--integrators", nargs="+", default=["Euler", "RK4"])
+    parser.add_argument("--integrators", nargs="+", default=["Euler", "RK4", "implicitfast"])
     parser.add_argument("--settings", nargs="+", default=["none"], help="such as no_spring+no_damper, none, or all")
     parser.add_argument("--groups", nargs="+", default=[*GROUPS], help="of features")
     parser.add_argument("--features", nargs="+", help="instead of groups")

@@ -1,4 +1,4 @@
-"""Differences between the MJX engines and MuJoCo's C library, of which the user is warned."""
+"""Differences between the MJX engines and MuJoCo's C library, and slow compilation, of which the user is warned."""
 
 import logging
 from collections.abc import Iterator
@@ -26,12 +26,20 @@ _AS_IN_MUJOCO = {
 Errors of velocities after a physics step, in 48 states of one falling body on one fixed geom, relative to one plus
 their change (90% of the states, largest): plane and mesh 2.7e-2, 2.0e-1; capsule and mesh 6.7e-2, 1.8e-1; box and mesh
 1.5e-2, 2.0e-1; two meshes 2.4e-2, 8.3e-2; sphere and mesh 1.5e-5, 6.6e-5. On a height field: sphere 6.9e-7, 1.2e-3;
-capsule 3.6e-3, 5.5e-2; box 1.8e-1, 4.9e-1; mesh 1.5e-1, 2.9e-1. Warp's are at most 3.6e-5 for meshes and 5.3e-4, 1.5e-3
-for spheres on height fields."""
+capsule 3.6e-3, 5.5e-2; box 1.8e-1, 4.9e-1; mesh 1.5e-1, 2.9e-1."""
+_NOT_ON_WARP = {(_Geom.mjGEOM_HFIELD, other) for other in (_Geom.mjGEOM_BOX, _Geom.mjGEOM_CYLINDER)}
+"""Pairs of geoms whose contacts the `warp` engine finds at other points than MuJoCo.
+
+The same errors: box 3.1e-3, 6.3; cylinder 2.6e-3, 2.7e-2. Others: height field and capsule 1.2e-4, 3.9e-3; height field
+and mesh 1.2e-3, 1.3e-2; meshes without a height field at most 3.6e-5."""
+
+_MANY_VERTICES = 64
+"""On two busy cores, MJX's step of Spot compiled in 4 minutes with at most 32 vertices a mesh. With the own hulls
+of the file, of up to 216, it had not compiled after 12 minutes."""
 
 
 def warn_of_approximations(model: mujoco.MjModel, engine: str, enough_iterations: int) -> None:
-    """Log a warning for what an MJX engine simulates, but otherwise than MuJoCo's C library.
+    """Log a warning for what an MJX engine simulates otherwise than MuJoCo's C library, or compiles slowly.
 
     Args:
         model: the model as loaded.
@@ -45,24 +53,50 @@ def warn_of_approximations(model: mujoco.MjModel, engine: str, enough_iterations
             fewest,
             engine,
         )
-    pair = next(_other_contacts(model), None) if engine == "jax" else None
+    pair = next(_other_contacts(model, engine), None)
     if pair:
         _LOGGER.warning(
-            "physics=jax finds other contact points than MuJoCo between %s and %s; physics=warp or c is closer",
+            "physics=%s finds other contact points than MuJoCo between %s and %s; physics=%s is closer",
+            engine,
             *(
                 f"{_kind(model, geom).name.removeprefix('mjGEOM_').lower()} '{model.geom(geom).name or geom}'"
                 for geom in pair
             ),
+            "warp or c" if engine == "jax" else "c",
+        )
+    mesh = next(_detailed_meshes(model), None) if engine == "jax" else None
+    if mesh is not None:
+        _LOGGER.warning(
+            "physics=jax compiles slowly for mesh '%s' with %d vertices; set its maxhullvert=\"32\", or physics=warp",
+            model.mesh(mesh).name or mesh,
+            _hull_vertices(model, mesh),
         )
 
 
-def _other_contacts(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
-    """Pairs of geoms whose contacts `jax` finds at other points than MuJoCo."""
+def _detailed_meshes(model: mujoco.MjModel) -> Iterator[int]:
+    """Meshes with many vertices that may touch another mesh."""
+    geoms, _ = pairs_that_move(model)
+    touching = geoms[(model.geom_type[geoms] == _Geom.mjGEOM_MESH).all(axis=1)]
+    for mesh in map(int, np.unique(model.geom_dataid[touching])):
+        if _hull_vertices(model, mesh) > _MANY_VERTICES:
+            yield mesh
+
+
+def _hull_vertices(model: mujoco.MjModel, mesh: int) -> int:
+    """Vertices of a mesh's convex hull, which MuJoCo computes for meshes that may touch something."""
+    address = model.mesh_graphadr[mesh]
+    return int(model.mesh_graph[address]) if address >= 0 else 0
+
+
+def _other_contacts(model: mujoco.MjModel, engine: str) -> Iterator[tuple[int, int]]:
+    """Pairs of geoms whose contacts an MJX engine finds at other points than MuJoCo."""
     geoms, _ = pairs_that_move(model)
     for first, second in geoms.tolist():
-        if (_kind(model, first), _kind(model, second)) not in _AS_IN_MUJOCO:
+        kinds = _kind(model, first), _kind(model, second)
+        if kinds not in _AS_IN_MUJOCO if engine == "jax" else kinds in _NOT_ON_WARP:
             yield first, second
-    yield from _parallel_capsules(model, geoms)
+    if engine == "jax":
+        yield from _parallel_capsules(model, geoms)
 
 
 def _kind(model: mujoco.MjModel, geom: int) -> mujoco.mjtGeom:

@@ -13,9 +13,12 @@ __all__ = ["MIN_SOLVER_ITERATIONS", "read_derived", "solver_iterations", "state_
 
 MIN_SOLVER_ITERATIONS = 8
 """Newton iterations and line-search steps. In float32, 8 give the same result as 50; 4 do only with few contacts."""
-_ITERATIONS_OF_MANY_PAIRS = 16
-"""With 8, Unitree's G1 and Spot with its arm had errors of 4.2 and 0.96 rad/s after 10 substeps from a standing pose,
-2.2e-2 and 1.5e-4 with 16, and the same with 50. Other robots with as many pairs needed no more than 8."""
+_MORE_ITERATIONS = 16
+"""For elliptic cones, and for many pairs of geoms.
+
+Largest errors of robots' velocities after 10 substeps from a standing pose, with 8 and with 16 iterations: G1 on `jax`
+4.2 and 2.2e-2 rad/s, Spot with its arm on `warp` 0.96 and 1.5e-4. With elliptic cones on `warp`: HyQReal 3.9e-2 and
+2.8e-4, Go2 6.4e-3 and 3.8e-5. 50 iterations give the same as 16."""
 _FEW_PAIRS = 126
 """Most pairs of geoms that may touch, for `MIN_SOLVER_ITERATIONS`: as many as Humanoid has, for which they suffice."""
 
@@ -41,8 +44,9 @@ def with_newton_solver(model: mujoco.MjModel) -> mujoco.MjModel:
 
 def solver_iterations(model: mujoco.MjModel) -> int:
     """Newton iterations and line-search steps with which the constraint solver converges in float32."""
-    has_few_pairs = len(pairs_that_move(model)[0]) <= _FEW_PAIRS
-    return MIN_SOLVER_ITERATIONS if has_few_pairs else max(MIN_SOLVER_ITERATIONS, _ITERATIONS_OF_MANY_PAIRS)
+    is_elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    needs_more = is_elliptic or len(pairs_that_move(model)[0]) > _FEW_PAIRS
+    return max(MIN_SOLVER_ITERATIONS, _MORE_ITERATIONS) if needs_more else MIN_SOLVER_ITERATIONS
 
 
 def with_state(data: mjx.Data, state: PhysicsState) -> mjx.Data:

@@ -106,6 +106,17 @@ def _exact_filters_with_rk4(model: mujoco.MjModel) -> Mask:
     return is_exact & (model.actuator_actadr >= 0) & (model.opt.integrator == _Integrator.mjINT_RK4)
 
 
+@FEATURES.entry(
+    ("warp",), None, "implicitfast with this flag", 'remove the flag, or set integrator="Euler" in <option>'
+)
+def _implicit_without_damper_or_actuation(model: mujoco.MjModel) -> Iterator[str]:
+    """Flags with which Warp leaves out the derivatives of servos as well as of dampers."""
+    if model.opt.integrator == _Integrator.mjINT_IMPLICITFAST:
+        for flag, name in ((_Flag.mjDSBL_DAMPER, "damper"), (_Flag.mjDSBL_ACTUATION, "actuation")):
+            if model.opt.disableflags & flag:
+                yield f'<flag {name}="disable"/>'
+
+
 @FEATURES.entry(EVERY_ENGINE, "actuator", "actuators with a delay", "remove nsample and delay")
 def _delayed_actuators(model: mujoco.MjModel) -> Mask:
     return any_of(model.actuator_history)

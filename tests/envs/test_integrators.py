@@ -10,8 +10,10 @@ from helpers import slow_except
 from mjx_walk.envs.physics import PhysicsState, make_engine
 
 NUM_SUBSTEPS = 5
-MOTORS = ("filter_affine", "filterexact_actrange", "integrator_servo", "muscle", "servo_forcerange", "tendon_servo")
-FEATURES = ("damping", "gravcomp", "fixed_damping", "free_offset", *MOTORS)
+FEATURES = (
+    *("damping", "gravcomp", "fixed_damping", "free_offset", "affine", "filter_affine", "filterexact_actrange"),
+    *("integrator_servo", "muscle", "servo_forcerange", "tendon_servo"),
+)
 """Joints, tendons, motors and a free body with all terms of the implicit integrators. They touch the floor."""
 TOLERANCE = {"c": 1e-6, "jax": 2e-5, "warp": 2e-5}
 """Largest error of a position, velocity or activation, relative to one plus its change."""

@@ -11,6 +11,7 @@ from trajectories import visited_states
 from mjx_walk.envs.physics import PhysicsState, make_engine, static_pairs
 from mjx_walk.envs.physics.approximations import warn_of_approximations
 from mjx_walk.envs.physics.jax_model import adapt_model
+from mjx_walk.envs.physics.mjx_model import solver_iterations
 from mjx_walk.envs.physics.static_pairs import drop_static_pairs
 from mjx_walk.utils.errors import UserError
 
@@ -63,6 +64,15 @@ CAPSULES = """
 </mujoco>
 """
 TETRAHEDRON = '<mesh name="tetrahedron" vertex="0 0 0 .2 0 0 0 .2 0 0 0 .2"/>'
+HEIGHT_FIELD = """
+<mujoco>
+  <asset><hfield name="h" nrow="2" ncol="2" size="1 1 .1 .1" elevation="0 1 0 .5"/></asset>
+  <worldbody>
+    <geom type="hfield" hfield="h"/>
+    <body pos="0 0 .3"><freejoint/><geom type="{}" size=".1 .1 .1"/></body>
+  </worldbody>
+</mujoco>
+"""
 ALL, MJX, JAX, WARP = ("c", "jax", "warp"), ("jax", "warp"), ("jax",), ("warp",)
 
 REFUSED = {
@@ -91,6 +101,14 @@ REFUSED = {
         {"option": 'integrator="RK4"', "motor": GENERAL.format('dyntype="filterexact" dynprm=".05"')},
         "filterexact and inductance with RK4 (motor 'm'); set integrator=",
     ),
+    **{
+        f"implicitfast_no_{name}": (
+            WARP,
+            {"option": 'integrator="implicitfast"', "flag": f'<flag {name}="disable"/>'},
+            f'implicitfast with this flag (<flag {name}="disable"/>); remove the flag',
+        )
+        for name in ("damper", "actuation")
+    },
     "implicitfast_in_water": (
         JAX,
         {"option": 'integrator="implicitfast" density="1000"'},
@@ -337,6 +355,40 @@ def test_capsules_that_stay_parallel_are_warned_of(end, contact, is_warned_of, c
     """MuJoCo has two contacts between them, the `jax` engine one."""
     warn_of_approximations(mujoco.MjModel.from_xml_string(CAPSULES.format(contact, end)), "jax", 0)
     assert ("between capsule '0' and capsule '1'; physics=warp" in caplog.text) == is_warned_of
+
+
+@pytest.mark.parametrize(
+    ("kind", "warned"), [("sphere", ()), ("capsule", ("jax",)), ("box", ("jax", "warp")), ("cylinder", ("warp",))]
+)
+def test_contacts_on_a_height_field_are_as_in_mujoco_or_warned_of(kind, warned, caplog):
+    model = mujoco.MjModel.from_xml_string(HEIGHT_FIELD.format(kind))
+    for engine in ("jax", "warp") if kind != "cylinder" else ("warp",):  # jax refuses cylinders
+        caplog.clear()
+        warn_of_approximations(model, engine, 0)
+        says = f"physics={engine} finds other contact points than MuJoCo between hfield '0' and {kind} '1'"
+        assert (says in caplog.text) == (engine in warned)
+
+
+def test_the_solver_has_more_iterations_for_elliptic_cones_and_many_pairs_of_geoms():
+    """Robots need them; Humanoid with 126 pairs and smaller models do not."""
+    body = '<body pos="{0} 0 0"><freejoint/><geom size=".1"/></body>'
+    for cone, num_bodies, expected in (("pyramidal", 16, 8), ("pyramidal", 17, 16), ("elliptic", 2, 16)):
+        bodies = "".join(body.format(i) for i in range(num_bodies))
+        text = f'<mujoco><option cone="{cone}"/><worldbody>{bodies}</worldbody></mujoco>'
+        assert solver_iterations(mujoco.MjModel.from_xml_string(text)) == expected
+
+
+@pytest.mark.parametrize(("engine", "is_warned_of"), [("jax", True), ("warp", False)])
+def test_detailed_meshes_compile_slowly_on_jax(engine, is_warned_of, caplog):
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    body = '<body pos="{0} 0 0"><freejoint/><geom type="mesh" mesh="stone"/></body>'
+    for attribute, says in (("", is_warned_of), ('maxhullvert="32"', False)):
+        mesh = f'<mesh name="stone" vertex="{" ".join(map(str, points.ravel()))}" {attribute}/>'
+        text = f"<mujoco><asset>{mesh}</asset><worldbody>{body.format(0)}{body.format(3)}</worldbody></mujoco>"
+        caplog.clear()
+        warn_of_approximations(mujoco.MjModel.from_xml_string(text), engine, 0)
+        assert ("slowly for mesh 'stone' with 100 vertices; set its maxhullvert=\"32\"" in caplog.text) == says
 
 
 def test_contacts_between_bodies_that_cannot_move_are_dropped():

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gpu_gate import checked_rows, require, run, run_python
+from helpers import CLONE
 
 from mjx_walk import zoo
 from mjx_walk.envs import GYMNASIUM_TASKS
@@ -41,6 +42,15 @@ def bent(step):
 """
 SMALL = ("algo=ppo", "num_envs=512", "iterations_per_call=2", "evaluation.gymnasium_episodes=2")
 
+IMPLICITFAST = """
+import sys
+sys.path[:0] = ["tests", "tests/envs"]
+import feature_models
+import jax
+from test_integrators import FEATURES, assert_equal_steps
+assert jax.default_backend() == "gpu"
+assert_equal_steps(feature_models.load(*FEATURES, option='integrator="implicitfast"'), "warp")
+"""
 BATCHES = """
 import gymnasium
 import numpy as np
@@ -78,6 +88,10 @@ def test_parity(physics, name, version, record_property):
     (steps,) = re.findall(r": ([\d,]+) steps", printed)
     (terminations,) = re.findall(r"(\d+ terminations, \d+ mismatches)", printed)
     record_property("measured", f"{steps} steps, {terminations}")
+
+
+def test_implicitfast_with_activations():
+    run_python(IMPLICITFAST, cwd=CLONE)
 
 
 def test_own_task(tmp_path):
