@@ -24,6 +24,7 @@ from helpers import (
     unregistered,
 )
 from shared_programs import shared_programs
+from small_robot import small_robot
 
 import mjx_walk
 from mjx_walk import zoo
@@ -211,12 +212,13 @@ def test_every_command(line, small_run, tmp_path, monkeypatch, capfd):
     """As it stands there, but for sizes and places."""
     monkeypatch.chdir(tmp_path)
     exec(compile(file("heavy_torso.py"), "heavy_torso.py", "exec"), {})
+    Path("go2.xml").write_text(small_robot())
     if "own_robot.py" in line:
         pytest.importorskip("dm_control")
         shutil.copytree(CLONE / "docs" / "examples", "docs/examples")
     line = re.sub(r" (num_envs=N|total_steps=N|viewer=true)", "", line)
     line = line.replace("env=TASK", "env=walker2d").replace("algo=ALGORITHM", "algo=ppo")
-    line = line.replace("RUN_DIR", str(small_run))
+    line = line.replace("RUN_DIR", str(small_run)).replace("zoo:NAME", "zoo:inverted_pendulum-csac")
     line = re.sub(r"=(PATH|DIR|/shared/humanoid)", f"={tmp_path}/there", smaller(line))
     name, *arguments = shlex.split(line)
     if "resume=true" in arguments:
