@@ -51,6 +51,7 @@ def test_speeds_are_compared_with_one_device_s(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_what_a_device_does_in_a_call_is_recorded():
     """In a training in one process, and in one in two, of which the first one records."""
     shared = [*SCALED, *share_of_total(load_config(SCALED), 2)]

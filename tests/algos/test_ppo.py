@@ -89,7 +89,7 @@ def test_ppo_update_equals_brax(monkeypatch):
     assert all(np.isfinite(value) for name, value in metrics.items() if not name.startswith("eval"))
 
 
-@pytest.mark.parametrize("physics", slow_except(["c"], ["c", "jax"]))
+@pytest.mark.parametrize("physics", ["c", pytest.param("jax", marks=[pytest.mark.slow, pytest.mark.long])])
 def test_small_batch_training_learns(physics):
     """Sixteen walkers that are rewarded for standing learn to stand longer."""
     task = make_env("walker2d", physics=physics, forward_reward_weight=0.0)

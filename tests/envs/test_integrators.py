@@ -62,7 +62,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("case", slow_except(["c implicit", "jax implicitfast"], CASES))
+@pytest.mark.parametrize("case", slow_except(["c implicit"], CASES))
 def test_a_step_equals_mujocos(case):
     engine, integrator = case.split()
     assert_equal_steps(feature_models.load(*FEATURES, option=f'integrator="{integrator}"'), engine)

@@ -164,7 +164,7 @@ def own_leaves(tiny):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tiny", [TINY, (*TINY_OFF_POLICY, "algo=sac")])
+@pytest.mark.parametrize("tiny", [pytest.param(TINY, marks=pytest.mark.long), (*TINY_OFF_POLICY, "algo=sac")])
 def test_two_processes_learn_the_same_and_resume_exactly(tmp_path, tiny):
     scored = run(tmp_path / "full", f"total_steps={4 * CALL}", "evaluation.gymnasium_episodes=1", tiny=tiny)
     assert "2 ×" in scored.stdout and f"Final policy (step {4 * CALL} of {4 * CALL}), Walker2d-v5: " in scored.stdout
