@@ -10,7 +10,7 @@ from brax.training import acting
 from brax.training.agents.ppo import networks as brax_networks
 from brax.training.agents.ppo import train as brax_ppo
 from brax.training.agents.ppo.losses import PPONetworkParams
-from helpers import OPTIMIZED, slow_except, values
+from helpers import OPTIMIZED, values
 from peers import restore_device_put_replicated
 from toy_tasks import BraxSizes, ConstantReward, EndlessReward
 
