@@ -148,7 +148,7 @@ class Locomotion(Task):
         }
 
     def observe(self, physics: PhysicsState, derived: Derived) -> Float[Array, " sensed"]:
-        """What the robot senses.
+        """The robot's own senses.
 
         It holds the angular velocity in the torso's frame (3, rad/s), the direction of gravity in that frame (3), joint
         positions relative to the standing pose (servos, rad), and joint velocities (servos, rad/s).
@@ -158,7 +158,7 @@ class Locomotion(Task):
         return jnp.concatenate([physics.qvel[3:6], self._gravity(physics), positions, velocities])
 
     def observe_all(self, physics: PhysicsState, derived: Derived, carry: Carry) -> Float[Array, " observation_size"]:
-        """What the robot senses, the last action in [-1, 1] (servos), and the command (3, m/s, m/s and rad/s)."""
+        """The robot's own senses, the last action in [-1, 1] (servos), and the command (3, m/s, m/s and rad/s)."""
         return jnp.concatenate([self.observe(physics, derived), carry["last_action"], carry["command"]])
 
     def _gravity(self, physics: PhysicsState) -> Float[Array, "3"]:

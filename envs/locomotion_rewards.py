@@ -62,7 +62,7 @@ _ZERO_COMMAND = 0.01
 
 
 class LocomotionStep(NamedTuple):
-    """What the reward of one step depends on."""
+    """Quantities on which the reward of one step depends."""
 
     command: Array
     """`[3] f32`: commanded forward, sideways and turning velocity, m/s, m/s and rad/s."""

@@ -69,7 +69,7 @@ def main(command_line: list[str]) -> None:
 
 
 def _metadata(run: Run) -> dict[str, str]:
-    """What a program needs to use the policy, as text; lists and numbers are JSON."""
+    """Facts that a program needs to use the policy, as text; lists and numbers are JSON."""
     task, model = run.task, run.task.model
     keywords = task.gymnasium_kwargs()
     if "xml_file" in keywords:  # the folder may name the user
