@@ -1,9 +1,7 @@
-"""Score exported policies with the installed MuJoCo, whose version may differ from the one of the training.
+"""`python benchmarks/mujoco_versions.py FILE.onnx …`: score exported policies with the installed MuJoCo.
 
-    python benchmarks/mujoco_versions.py FILE.onnx … [--episodes 20] [--seed 10000]
-
-Needs only gymnasium, mujoco and onnxruntime, so that it runs in a virtual environment with another MuJoCo.
-`python -m mjx_walk.export` writes the files. It prints a row of CSV for each policy.
+It needs only gymnasium, mujoco and onnxruntime, so that it runs in a virtual environment with another MuJoCo than that
+of the training.
 """
 
 import argparse
@@ -20,9 +18,13 @@ import onnxruntime
 
 __all__ = ["play"]
 
+_DESCRIPTION = """
+Score policies that python -m mjx_walk.export wrote, in Gymnasium with the installed MuJoCo. Print CSV, a row for each.
+"""
+
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser("python benchmarks/mujoco_versions.py", description=_DESCRIPTION)
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--seed", type=int, default=10_000)

@@ -14,7 +14,10 @@ from mjx_walk.algos import BUILT_IN_ALGORITHMS
 from mjx_walk.envs import BUILT_IN_TASKS, GYMNASIUM_TASKS
 
 DOCS = Path(__file__).parent
-_OF_SCORES = ("best_evaluations", "complete_episodes", "cpu", "cpu_tasks", "robustness", "slm_lab_drafts")
+_OF_SCORES = (
+    *("best_evaluations", "complete_episodes", "cpu", "cpu_tasks"),
+    *("mujoco_versions", "robustness", "slm_lab_drafts"),
+)
 """Tables of measured/ that results.md shows. speed.md shows the others."""
 
 

@@ -3,12 +3,14 @@
 import json
 import re
 import runpy
+import subprocess
 import sys
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import pytest
-from helpers import CLONE, PAGES, TINY_OFF_POLICY
+from helpers import CLONE, PAGES, TINY_OFF_POLICY, command_here
 from program_costs import matmul_flops, reduced_bytes
 
 from mjx_walk.utils import collectives
@@ -25,10 +27,21 @@ def exit_code(name, *arguments):
 
 def test_programs_that_the_documentation_names_are_there(capsys):
     named = {name for text in PAGES.values() for name in re.findall(r"python benchmarks/(\S+\.py)", text)}
-    assert named == {"peers.py", "training_parts.py"}
+    assert named == {"mujoco_versions.py", "peers.py", "training_parts.py"}
     for name in named:
         assert exit_code(name, "--help") == 0
         assert capsys.readouterr().out.startswith(f"usage: python benchmarks/{name} ")
+
+
+def test_exported_policies_are_scored_without_this_package(tmp_path):
+    assert command_here("export", "run=zoo:inverted_pendulum-csac", f"out={tmp_path}/pendulum.onnx") == 0
+    code = (CLONE / "benchmarks" / "mujoco_versions.py").read_text()
+    code += '\n    assert not {"jax", "mjx_walk"} & set(sys.modules)\n'
+    (tmp_path / "score.py").write_text(code)
+    line = [sys.executable, "score.py", "pendulum.onnx", "--episodes", "2"]
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=True)
+    header, row = done.stdout.splitlines()
+    assert header == "Policy,MuJoCo,Episodes,Mean,Std" and row == f"pendulum,{mujoco.__version__},2,1000.00,0.00"
 
 
 @pytest.mark.slow
