@@ -9,6 +9,7 @@ import mujoco
 from mjx_walk import __version__, zoo
 from mjx_walk.api import Run, load_run
 from mjx_walk.cli import parsing
+from mjx_walk.envs.motors import joint_of
 from mjx_walk.evaluation.saved_policies import kept_policies
 from mjx_walk.settings.own_tasks import take_task
 from mjx_walk.storage.files import replacing, user_path
@@ -69,7 +70,7 @@ def main(command_line: list[str]) -> None:
 
 
 def _metadata(run: Run) -> dict[str, str]:
-    """Facts that a program needs to use the policy, as text; lists and numbers are JSON."""
+    """Facts that a program needs to use the policy, as text; lists, numbers and groups of options are JSON."""
     task, model = run.task, run.task.model
     keywords = task.gymnasium_kwargs()
     if "xml_file" in keywords:  # the folder may name the user
@@ -85,14 +86,17 @@ def _metadata(run: Run) -> dict[str, str]:
         "env_steps": run.policy_metadata["env_steps"],
     }
     names = {"task": task.gymnasium_id, "algorithm": run.config.algo.name, "policy": run.policy_name}
-    return names | {"mjx_walk": __version__} | {name: json.dumps(fact) for name, fact in facts.items()}
+    return (
+        names
+        | {"mjx_walk": __version__}
+        | {name: json.dumps(fact, default=dataclasses.asdict) for name, fact in facts.items()}
+    )
 
 
 def _motor_name(model: mujoco.MjModel, index: int) -> str:
     """Name of a motor, or of the joint that it moves if it has none."""
-    name, joint = model.actuator(index).name, int(model.actuator_trnid[index, 0])
-    on_joint = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_JOINT
-    return name or (model.joint(joint).name if on_joint else "")
+    joint = joint_of(model, index)
+    return model.actuator(index).name or ("" if joint is None else model.joint(joint).name)
 
 
 if __name__ == "__main__":

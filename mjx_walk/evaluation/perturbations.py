@@ -43,9 +43,8 @@ def perturb(env: MujocoEnv, perturbation: Perturbation, seed: int) -> None:
         seed: of the directions of the pushes.
     """
     model = env.model
-    for friction in (model.geom_friction, model.pair_friction):
-        friction[:, 0] *= perturbation.friction
-    model.pair_friction[:, 1] *= perturbation.friction  # a pair has two sliding directions
+    model.geom_friction[:, 0] *= perturbation.friction
+    model.pair_friction[:, :2] *= perturbation.friction  # a pair has two sliding directions
     if perturbation.mass != 1.0:
         model.body_mass[:] *= perturbation.mass
         model.body_inertia[:] *= perturbation.mass

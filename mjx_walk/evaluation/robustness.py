@@ -70,12 +70,11 @@ class Robustness:
     def lines(self) -> list[str]:
         """A table, and the summary."""
         rows = [f"  {'nominal':<10}{self.nominal.mean:>11,.1f}"]
-        for name, strengths in STRENGTHS.items():
+        for name in STRENGTHS:
             cells = [cell for cell in self.single if cell.name == name]
             header = "".join(f"{cell.label:>11}" for cell in cells)
             values = "".join(f"{cell.mean:>11,.1f}" for cell in cells)
             rows += [f"  {name:<10}{header}", f"  {'':<10}{values}"]
-            assert len(cells) == len(strengths)
         rows.append(f"  {'all':<10}{self.together.mean:>11,.1f}  at {self.together.label}")
         worst = self.worst
         return [
@@ -93,7 +92,8 @@ class Robustness:
     def write(self, path: Path) -> None:
         """Write all returns as JSON, with the versions of the packages."""
         cells = [
-            dataclasses.asdict(cell) | {"returns": cell.returns.tolist()} for cell in (*self.single, self.together)
+            {"name": cell.name, "label": cell.label, "returns": cell.returns.tolist()}
+            for cell in (*self.single, self.together)
         ]
         content = {
             "env": self.env,

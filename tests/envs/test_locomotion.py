@@ -1,9 +1,13 @@
 """The task of a robot that follows commanded velocities: observation, commands, reward, falls, and its engines."""
 
+import json
+from pathlib import Path
+
 import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+import onnx
 import pytest
 from helpers import OPTIMIZED, TINY, TINY_CALL, command_here, leaves, train_here
 from scipy.spatial.transform import Rotation
@@ -179,7 +183,7 @@ def test_what_needs_a_model_says_so(path):
 def test_a_run_is_trained_resumed_scored_and_exported(tmp_path, monkeypatch, path, capsys):
     """A resumed run equals an uninterrupted one bit for bit, with the commands and the keys of its environments."""
     monkeypatch.chdir(tmp_path)
-    settings = ["env=locomotion", f"env.xml_file={path}", "env.command_seconds=[0.02,0.1]"]
+    settings = ["env=locomotion", f"env.xml_file={path}", "env.command_seconds=[0.02,0.1]", "env.weights.pose=0.4"]
     for folder, steps in (("whole", 4), ("parts", 2)):
         train_here(folder, *settings, f"total_steps={steps * TINY_CALL}", tiny=TINY[1:])
     train_here("parts", "resume=true", f"total_steps={4 * TINY_CALL}", tiny=[])
@@ -189,7 +193,10 @@ def test_a_run_is_trained_resumed_scored_and_exported(tmp_path, monkeypatch, pat
         np.testing.assert_array_equal(leaf, parts[name], err_msg=name)
     assert command_here("eval", "run=parts", "episodes=2") == 0 and "locomotion on c" in capsys.readouterr().out
     assert command_here("export", "run=parts", "format=onnx", "out=policy.onnx") == 0
-    assert (tmp_path / "policy.onnx").exists()
+    facts = {prop.key: prop.value for prop in onnx.load(tmp_path / "policy.onnx").metadata_props}
+    keywords = json.loads(facts["keywords"])
+    assert keywords["weights"]["pose"] == 0.4 and keywords["xml_file"] == Path(path).name
+    assert facts["task"] == "locomotion" and len(json.loads(facts["motors"])) == SERVOS
 
 
 @pytest.mark.slow
