@@ -33,6 +33,7 @@ def pages() -> dict[Path, str]:
     found[DOCS / "training.md"] = _filled("training.md", {"scaling-summary": scaling.summary()})
     robots = {name: setting_tables.task_tables(name) for name in BUILT_IN_TASKS if name not in GYMNASIUM_TASKS}
     found[DOCS / "your_own.md"] = _filled("your_own.md", robots)
+    groups["presets"] = setting_tables.presets()
     found[DOCS / "configuration.md"] = _filled("configuration.md", groups)
     texts = {name: (DOCS / "algorithms" / f"{name}.md").read_text() for name in BUILT_IN_ALGORITHMS}
     index = {"algorithms": setting_tables.algorithms(texts), "pages": toctree(BUILT_IN_ALGORITHMS)}

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from numpy.typing import ArrayLike
 
 from mjx_walk.envs.physics import PhysicsState
+from mjx_walk.envs.randomization.episode import Draws
 from mjx_walk.utils.errors import UserError
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "TrainableTask",
     "check_action_shape",
     "first_state",
+    "in_same_episode",
     "is_finite",
     "physics_state",
 ]
@@ -53,10 +55,16 @@ class State(flax.struct.PyTreeNode):
     """`[] i32`: steps since the reset."""
     metrics: dict[str, Array]
     """`[] f32` each: the reward terms under the names of Gymnasium's `info`, `nonfinite` and `overflow`."""
+    draws: Draws | None = None
+    """Randomness of the episode; None if the task's physics are not randomized."""
 
 
 def first_state(
-    physics: PhysicsState, memory: Carry, obs: Float[Array, " observation_size"], metric_names: tuple[str, ...]
+    physics: PhysicsState,
+    memory: Carry,
+    obs: Float[Array, " observation_size"],
+    metric_names: tuple[str, ...],
+    draws: Draws | None = None,
 ) -> State:
     """The state at the start of an episode."""
     return State(
@@ -68,6 +76,7 @@ def first_state(
         truncated=jnp.zeros((), bool),
         steps=jnp.zeros((), jnp.int32),
         metrics={name: jnp.zeros((), jnp.float32) for name in metric_names},
+        draws=draws,
     )
 
 
@@ -87,6 +96,7 @@ def physics_state(
     qvel: Float[Array | np.ndarray, " nv"],
     warmstart: Float[Array | np.ndarray, " nv"] | None = None,
     act: Float[Array | np.ndarray, " na"] | None = None,
+    model_index: Int[Array, ""] | None = None,
 ) -> PhysicsState:
     """The physics state of a model at a position and velocity, in float32.
 
@@ -96,6 +106,7 @@ def physics_state(
         qvel: m/s and rad/s.
         warmstart: initial guess of the constraint solver, m/s² and rad/s². Default: zeros.
         act: activations of actuators. Default: zeros, as after `mj_resetData`.
+        model_index: of a changed model, if the engine has some.
 
     Raises:
         UserError: an array has another shape.
@@ -107,7 +118,13 @@ def physics_state(
             raise UserError(f"{name} has the shape {np.shape(array)}; give ({size},), and use jax.vmap for a batch")
         found.append(jnp.zeros(size, jnp.float32) if array is None else jnp.asarray(array, jnp.float32))
     position, velocity, guess, activation = found
-    return PhysicsState(position, velocity, guess, activation if model.na else None)
+    return PhysicsState(position, velocity, guess, activation if model.na else None, model_index)
+
+
+def in_same_episode(old: State, new: State) -> State:
+    """The new state with the randomness of the old one: its model, its late actions and the time of its next push."""
+    physics = new.physics._replace(model_index=old.physics.model_index)
+    return new.replace(physics=physics, draws=old.draws)
 
 
 def is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[Array, ""]:

@@ -15,6 +15,7 @@ from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.model_files import source_hashes
 from mjx_walk.envs.motors import motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
+from mjx_walk.envs.randomization.episode import Randomizer
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping, shaping_terms, term_names
 from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape, first_state, is_finite, physics_state
@@ -80,7 +81,9 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         self.dt = self.model.opt.timestep * self.num_substeps()
         self.kept_arrays = self.info_arrays() if keep_info else ()
         derived = tuple(dict.fromkeys((*self.derived_names(), *self.kept_arrays)))
-        self.engine = make_engine(resolve_engine(physics), self.model, self.num_substeps(), derived)
+        engine, substeps = resolve_engine(physics), self.num_substeps()
+        self.randomizer = Randomizer(options.randomize, self.model, substeps, self.action_range())
+        self.engine = make_engine(engine, self.model, substeps, derived, self.randomizer.models)
         models.check_pose(self.model, derived)
         self._snapshot = ModelSnapshot(self.model, derived)
         self.action_low, self.action_high = map(jnp.float32, self.action_range())
@@ -209,17 +212,19 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
             qvel: m/s and rad/s.
             warmstart: initial guess of the constraint solver (`qacc_warmstart`), m/s² and rad/s². Default: zeros.
             act: activations of actuators. Default: zeros, as after `mj_resetData`.
-            key: for the random values of the task's carry. Default: seed 0.
+            key: for random values of the task's carry and for randomized physics. Default: seed 0.
 
         Raises:
             UserError: another shape, or `model` has changed. A traced reset raises it while it is traced.
         """
         self._snapshot.refuse_changes()
-        physics = physics_state(self.model, qpos, qvel, warmstart, act)
+        key = jax.random.PRNGKey(0) if key is None else key
+        draws = self.randomizer.draw_episode(key)
+        physics = physics_state(self.model, qpos, qvel, warmstart, act, self.randomizer.draw_model(key))
         derived = self.engine.forward(physics)
-        carry = self.initial_carry(jax.random.PRNGKey(0) if key is None else key, physics, derived)
-        obs = self.observe_all(physics, derived, carry)
-        return first_state(physics, carry | self._kept(derived), obs, self.metric_names)
+        carry = self.initial_carry(key, physics, derived)
+        obs = self.randomizer.observe(draws, self.observe_all(physics, derived, carry))
+        return first_state(physics, carry | self._kept(derived), obs, self.metric_names, draws)
 
     @standard_dtypes()
     def step(self, state: State, action: Float[Array, " action_size"]) -> State:
@@ -240,9 +245,10 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         self._snapshot.refuse_changes()
         check_action_shape(action, (self.action_size,))
         action = jnp.asarray(action, jnp.float32)
-        physics, derived, overflow = self.engine.step(state.physics, action)
+        draws, start, control = self.randomizer.disturb(state.draws, state.physics, action)
+        physics, derived, overflow = self.engine.step(start, control)
         carry = self.next_carry(state, physics, derived, action) | self._kept(derived)
-        obs = self.observe_all(physics, derived, carry)
+        obs = self.randomizer.observe(draws, self.observe_all(physics, derived, carry))
         terms, reward, terminated = self.reward_and_termination(state, physics, derived, carry, action)
         terms, reward = self._customize_reward(
             RewardStep(terms, reward, state.physics, physics, obs, action, terminated, self.dt)
@@ -267,6 +273,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
             truncated=steps >= self.max_episode_steps,
             steps=steps,
             metrics=terms | {"nonfinite": jnp.float32(~valid), "overflow": jnp.float32(overflow)},
+            draws=draws,
         )
 
     def _kept(self, derived: Derived) -> Carry:

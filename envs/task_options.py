@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from mjx_walk.envs.model_files import absolute_xml_file, model_path
+from mjx_walk.envs.randomization.options import Randomization, preset
 from mjx_walk.envs.reward_shaping import Shaping
 from mjx_walk.envs.state import NO_TIME_LIMIT
 from mjx_walk.envs.user_files import absolute_source
@@ -34,6 +35,8 @@ class TaskOptions:
     """Time limit, in environment steps."""
     shaping: Shaping = dataclasses.field(default_factory=Shaping)
     """Weights of additional reward terms."""
+    randomize: Randomization = dataclasses.field(default_factory=Randomization)
+    """Randomized physics of training, or the name of a preset."""
     reward_function: str | None = None
     """`PATH.py:FUNCTION`, a custom reward that replaces Gymnasium's; see `mjx_walk.envs.reward_shaping`."""
     task: str | None = None
@@ -41,6 +44,8 @@ class TaskOptions:
 
     def __post_init__(self):
         self.xml_file = self.xml_file or None
+        if isinstance(self.randomize, str):
+            self.randomize = preset(self.randomize)
         for name, value in list(vars(self).items()):
             if isinstance(value, list):  # a configuration file gives a range as a list
                 setattr(self, name, tuple(value))
@@ -65,7 +70,7 @@ class TaskOptions:
         return keywords
 
 
-_NOT_IN_GYMNASIUM = ("name", "version", "max_episode_steps", "shaping", "reward_function", "task")
+_NOT_IN_GYMNASIUM = ("name", "version", "max_episode_steps", "shaping", "randomize", "reward_function", "task")
 """Fields of `TaskOptions` that the constructors of Gymnasium's classes do not take."""
 
 

@@ -8,6 +8,7 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.envs import TASKS
+from mjx_walk.envs.randomization.options import PRESETS, Randomization, changes
 from mjx_walk.envs.reward_shaping import Shaping
 from mjx_walk.envs.task_options import TaskOptions
 from mjx_walk.settings.config import CheckpointConfig, Config
@@ -19,6 +20,7 @@ GROUPS = {
     "checkpoint": (CheckpointConfig, "checkpoint."),
     "task": (TaskOptions, "env."),
     "shaping": (Shaping, "env.shaping."),
+    "randomize": (Randomization, "env.randomize."),
 }
 """Groups of settings that do not depend on the task or the algorithm, with the start of their full keys."""
 
@@ -49,6 +51,15 @@ def _condition(text: str) -> str:
 def group_table(name: str) -> str:
     """The table of one of `GROUPS`."""
     return settings_table(*GROUPS[name])
+
+
+def presets() -> str:
+    """The settings of each preset of randomized physics."""
+    rows = []
+    for name, options in PRESETS.items():
+        settings = {key: list(value) if isinstance(value, tuple) else value for key, value in changes(options).items()}
+        rows.append([code(f"env.randomize={name}"), ", ".join(code(f"{key}={settings[key]}") for key in settings)])
+    return table(["Preset", "Settings"], rows)
 
 
 def task_tables(name: str) -> str:

@@ -4,10 +4,14 @@ Simulation of a MuJoCo model, the choice of an engine and patches of MJX belong 
 Observations, rewards and episodes do not.
 """
 
+import copy
 import importlib.util
 import warnings
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import mujoco
+import numpy as np
 
 from mjx_walk.envs.physics.approximations import warn_of_approximations
 from mjx_walk.envs.physics.base import Derived, Engine, PhysicsState
@@ -59,7 +63,13 @@ def resolve_engine(name: str) -> str:
     return name
 
 
-def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Engine:
+def make_engine(
+    name: str,
+    model: mujoco.MjModel,
+    num_substeps: int,
+    derived: tuple[str, ...],
+    models: Mapping[str, np.ndarray] = MappingProxyType({}),
+) -> Engine:
     """Create an engine.
 
     It imports the engine's module only now, so that Warp stays an optional dependency.
@@ -69,25 +79,42 @@ def make_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tu
         model: the MuJoCo model as loaded.
         num_substeps: physics steps per environment step (Gymnasium's `frame_skip`).
         derived: names of the `mjData` arrays that the task reads.
+        models: values of changed models by their names in `MjModel`, `[num_models, …]` each. If there are any,
+            `PhysicsState.model_index` chooses one.
 
     Raises:
         UserError: the engine does not simulate something that the model has, or does not return a derived array.
     """
     refuse_unsupported(model, name)
+    refuse_unsupported(_most_slippery(model, models), name)
     refuse_derived(model, name, derived)
     if name == "c":
         from mjx_walk.envs.physics.mujoco_c import CEngine
 
-        return CEngine(model, num_substeps, derived)
+        return CEngine(model, num_substeps, derived, models)
     try:
-        return _make_mjx_engine(name, model, num_substeps, derived)
+        return _make_mjx_engine(name, model, num_substeps, derived, models)
     except UserError:
         raise
     except (NotImplementedError, ValueError) as error:
         raise unsupported_by_mjx(name, error) from error
 
 
-def _make_mjx_engine(name: str, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Engine:
+def _most_slippery(model: mujoco.MjModel, models: Mapping[str, np.ndarray]) -> mujoco.MjModel:
+    """The model with the least friction of all changed ones. Engines do not simulate every friction."""
+    model = copy.copy(model)
+    for name in models.keys() & {"geom_friction", "pair_friction"}:
+        getattr(model, name)[:] = models[name].min(axis=0)
+    return model
+
+
+def _make_mjx_engine(
+    name: str,
+    model: mujoco.MjModel,
+    num_substeps: int,
+    derived: tuple[str, ...],
+    models: Mapping[str, np.ndarray],
+) -> Engine:
     from mjx_walk.machine import quiet_mjx  # noqa: F401  # isort: skip
     from mjx_walk.envs.physics.mjx_model import solver_iterations
 
@@ -95,7 +122,7 @@ def _make_mjx_engine(name: str, model: mujoco.MjModel, num_substeps: int, derive
     if name == "warp":
         from mjx_walk.envs.physics.mjx_warp import WarpEngine
 
-        return WarpEngine(model, num_substeps, derived)
+        return WarpEngine(model, num_substeps, derived, models)
     from mjx_walk.envs.physics.mjx_jax import JaxEngine
 
-    return JaxEngine(model, num_substeps, derived)
+    return JaxEngine(model, num_substeps, derived, models)

@@ -21,7 +21,7 @@ Derived = dict[str, Array]
 class PhysicsState(NamedTuple):
     """The complete state of a MuJoCo simulation.
 
-    It is position, velocity, initial guess of the constraint solver, and activations of actuators.
+    It is position, velocity, initial guess of the constraint solver, activations of actuators, and the model.
     """
 
     qpos: Array
@@ -32,6 +32,8 @@ class PhysicsState(NamedTuple):
     """`[nv] f32`, m/s² and rad/s²."""
     act: Array | None = None
     """`[na] f32`, activations of actuators. None in a model without them, so that such states keep their leaves."""
+    model_index: Array | None = None
+    """`[] i32`, which of the engine's changed models this is. None if the engine has one model."""
 
 
 class Engine(Protocol):
@@ -53,12 +55,14 @@ class Engine(Protocol):
         """
         ...
 
-    def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> tuple[PhysicsState, Derived, Bool[Array, ""]]:
-        """Advance by the engine's number of substeps at a constant control.
+    def step(
+        self, state: PhysicsState, ctrl: Float[Array, "*substeps nu"]
+    ) -> tuple[PhysicsState, Derived, Bool[Array, ""]]:
+        """Advance by the engine's number of substeps.
 
         Args:
             state: physics state of one environment.
-            ctrl: in the actuators' units, not clipped.
+            ctrl: in the actuators' units, not clipped: `[nu]`, or `[num_substeps, nu]` for a control that changes.
 
         Returns:
             The next state; the derived arrays of the last forward pass, which precede the last integration: with Euler

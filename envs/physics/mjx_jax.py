@@ -2,10 +2,12 @@
 
 import functools
 import operator
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 from mujoco import mjx
@@ -18,7 +20,14 @@ from mjx_walk.envs.physics import capsule_frames_jax, implicit_jax, static_pairs
 from mjx_walk.envs.physics.base import Derived, PhysicsState
 from mjx_walk.envs.physics.derived_arrays import LATE_ARRAYS, derived_shapes
 from mjx_walk.envs.physics.jax_model import adapt_model
-from mjx_walk.envs.physics.mjx_model import read_derived, state_of, with_newton_solver, with_state
+from mjx_walk.envs.physics.mjx_model import (
+    chosen_values,
+    mjx_values,
+    read_derived,
+    state_of,
+    with_newton_solver,
+    with_state,
+)
 from mjx_walk.envs.physics.preparation import Preparation
 
 __all__ = ["JaxEngine"]
@@ -33,7 +42,9 @@ class JaxEngine:
     name = "jax"
     calls_host = False
 
-    def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
+    def __init__(
+        self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...], models: Mapping[str, np.ndarray]
+    ):
         capsule_frames_jax.install()
         static_pairs.install()
         model = with_newton_solver(model)
@@ -44,6 +55,7 @@ class JaxEngine:
         self._num_substeps = num_substeps
         self.preparation = Preparation()
         self._derived = derived_shapes(model, derived)
+        self._values = mjx_values(self._own_model, models)
 
     def change_model(self, changes: dict[str, Array]) -> None:
         """Step a changed model from now on, for domain randomization. A program compiled before keeps its model.
@@ -56,23 +68,32 @@ class JaxEngine:
         changes = {path: jnp.asarray(value, operator.attrgetter(path)(own).dtype) for path, value in changes.items()}
         self._model = own.tree_replace(changes) if changes else own
 
-    def _data(self, state: PhysicsState) -> mjx.Data:
-        return with_state(self._blank, state)
+    def _model_of(self, state: PhysicsState) -> mjx.Model:
+        values = chosen_values(self._values, state.model_index)
+        return self._model.tree_replace(values) if values else self._model
 
     def forward(self, state: PhysicsState) -> Derived:
         """See `Engine.forward`."""
         with jax.default_matmul_precision("highest"):
-            data = _forward(self._model, self._data(state))
+            data = _forward(self._model_of(state), with_state(self._blank, state))
         return read_derived(data.replace(qpos=state.qpos), self._derived)  # MJX normalizes its quaternions
 
-    def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> tuple[PhysicsState, Derived, Bool[Array, ""]]:
+    def step(
+        self, state: PhysicsState, ctrl: Float[Array, "*substeps nu"]
+    ) -> tuple[PhysicsState, Derived, Bool[Array, ""]]:
         """See `Engine.step`. No buffer overflows: MJX allocates every possible contact."""
         with jax.default_matmul_precision("highest"):
-            data = self._data(state).replace(ctrl=ctrl)
-            data, _ = jax.lax.scan(lambda d, _: (self._substep(self._model, d), None), data, length=self._num_substeps)
+            model = self._model_of(state)
+            controls = ctrl if ctrl.ndim == 2 else None
+            data = with_state(self._blank, state).replace(ctrl=ctrl if controls is None else ctrl[0])
+
+            def substep(data, control):
+                return self._substep(model, data if control is None else data.replace(ctrl=control)), None
+
+            data, _ = jax.lax.scan(substep, data, controls, length=self._num_substeps)
             if self._derived.keys() & LATE_ARRAYS:
-                data = mjx_smooth.rne_postconstraint(self._model, data)
-        return state_of(data), read_derived(data, self._derived), jnp.zeros((), bool)
+                data = mjx_smooth.rne_postconstraint(model, data)
+        return state_of(data, state.model_index), read_derived(data, self._derived), jnp.zeros((), bool)
 
 
 def _forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:

@@ -1,15 +1,29 @@
 """Functions of both MJX engines: preparing the model and reading derived arrays."""
 
 import copy
+import dataclasses
+from collections.abc import Mapping
 
 import jax.numpy as jnp
 import mujoco
+import numpy as np
+from jax import Array
+from jaxtyping import Int
 from mujoco import mjx
 
 from mjx_walk.envs.physics.base import Derived, PhysicsState
 from mjx_walk.envs.physics.elements import pairs_that_move
 
-__all__ = ["MIN_SOLVER_ITERATIONS", "read_derived", "solver_iterations", "state_of", "with_newton_solver", "with_state"]
+__all__ = [
+    "MIN_SOLVER_ITERATIONS",
+    "chosen_values",
+    "mjx_values",
+    "read_derived",
+    "solver_iterations",
+    "state_of",
+    "with_newton_solver",
+    "with_state",
+]
 
 MIN_SOLVER_ITERATIONS = 8
 """Newton iterations and line-search steps. In float32, 8 give the same result as 50; 4 do only with few contacts."""
@@ -51,13 +65,35 @@ def solver_iterations(model: mujoco.MjModel) -> int:
 
 def with_state(data: mjx.Data, state: PhysicsState) -> mjx.Data:
     """MJX's data with another physics state. Both have the same names."""
-    return data.replace(**{name: array for name, array in state._asdict().items() if array is not None})
+    arrays = state._replace(model_index=None)._asdict()
+    return data.replace(**{name: array for name, array in arrays.items() if array is not None})
 
 
-def state_of(data: mjx.Data) -> PhysicsState:
-    """The physics state that MJX's data hold, with or without a batch axis."""
+def state_of(data: mjx.Data, model_index: Array | None = None) -> PhysicsState:
+    """The physics state that MJX's data hold, with or without a batch axis.
+
+    Args:
+        data: MJX's data.
+        model_index: of the model with which they were computed, if there are several.
+    """
     act = data.act if data.act.shape[-1] else None
-    return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, act)
+    return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, act, model_index)
+
+
+def mjx_values(model: mjx.Model, models: Mapping[str, np.ndarray]) -> dict[str, Array]:
+    """The values of changed models that MJX has. It has no bounding boxes of bodies, for example."""
+    fields = {field.name for field in dataclasses.fields(model)}
+    arrays = {name: getattr(model, name) for name in models if name in fields}
+    return {
+        name: jnp.asarray(models[name], array.dtype)
+        for name, array in arrays.items()
+        if jnp.issubdtype(array.dtype, jnp.floating)
+    }
+
+
+def chosen_values(values: dict[str, Array], model_index: Int[Array, "*batch"] | None) -> dict[str, Array]:
+    """The values of the models of that index; none without an index."""
+    return {} if model_index is None else {name: array[model_index] for name, array in values.items()}
 
 
 def read_derived(data: mjx.Data, shapes: dict[str, tuple[int, ...]], batch: tuple[int, ...] = ()) -> Derived:

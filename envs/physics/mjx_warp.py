@@ -1,7 +1,7 @@
 """The `warp` engine: MJX on MuJoCo Warp, for NVIDIA GPUs. It also runs on a CPU, slowly, for tests."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 
 import jax
@@ -16,7 +16,14 @@ from mujoco import mjx
 from mjx_walk.envs.physics import body_forces, capsule_frames_warp
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.derived_arrays import LATE_ARRAYS, derived_shapes, fills_late_arrays
-from mjx_walk.envs.physics.mjx_model import read_derived, state_of, with_newton_solver, with_state
+from mjx_walk.envs.physics.mjx_model import (
+    chosen_values,
+    mjx_values,
+    read_derived,
+    state_of,
+    with_newton_solver,
+    with_state,
+)
 from mjx_walk.envs.physics.preparation import Preparation
 from mjx_walk.envs.physics.static_pairs import drop_static_pairs
 from mjx_walk.envs.physics.warp_kernels import choose_cache, load_kernels
@@ -45,7 +52,9 @@ class WarpEngine:
     name = "warp"
     calls_host = False
 
-    def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
+    def __init__(
+        self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...], models: Mapping[str, np.ndarray]
+    ):
         choose_cache()
         capsule_frames_warp.install()
         # On a CPU, this hides Warp's warning about a missing GPU.
@@ -63,6 +72,7 @@ class WarpEngine:
         self._mjx_step = _over_batch(mjx.step, self._model)
         self._last_mjx_step = _over_batch(mjx.step, last_model)
         self._num_substeps = num_substeps
+        self._values = mjx_values(self._model, models)
         # Equality constraints and frictional joints have a row each in every step, unlike contacts and limits.
         with_friction = np.count_nonzero(model.dof_frictionloss) + np.count_nonzero(model.tendon_frictionloss)
         self._njmax = CONSTRAINTS_PER_ENV + model.neq + int(with_friction)
@@ -95,31 +105,38 @@ class WarpEngine:
         return jax.vmap(functools.partial(with_state, blank))(state)
 
     def _forward(self, state: PhysicsState) -> Derived:
-        data = self._mjx_forward(self._data(state)).replace(qpos=state.qpos)  # MJX normalizes its quaternions
+        values = chosen_values(self._values, state.model_index)
+        data = self._mjx_forward(values, self._data(state)).replace(qpos=state.qpos)  # MJX normalizes its quaternions
         derived = read_derived(data, self._derived, state.qpos.shape[:1])
         if fills_late_arrays(self._mj_model):
             return derived
         # Warp uses these for the bias forces.
         return derived | {name: jnp.zeros_like(derived[name]) for name in self._body_forces}
 
-    def _step(self, state: PhysicsState, ctrl: Float[Array, "B nu"]) -> tuple[PhysicsState, Derived, Bool[Array, " B"]]:
-        data = self._data(state).replace(ctrl=self._used_control(ctrl))
+    def _step(
+        self, state: PhysicsState, ctrl: Float[Array, "B *substeps nu"]
+    ) -> tuple[PhysicsState, Derived, Bool[Array, " B"]]:
+        values = chosen_values(self._values, state.model_index)
+        used = self._used_control(ctrl)
+        data = self._data(state).replace(ctrl=used if used.ndim == 2 else used[:, 0])
         overflow = lost_rows = jnp.zeros(ctrl.shape[0], bool)
         for substep in range(self._num_substeps):
             is_last = substep == self._num_substeps - 1
-            data = self._last_mjx_step(data) if is_last else self._mjx_step(data)
+            if used.ndim == 3:
+                data = data.replace(ctrl=used[:, substep])
+            data = (self._last_mjx_step if is_last else self._mjx_step)(values, data)
             # All environments share the buffers, so any of them may have lost a contact.
             # `nacon` does not count the pairs that Warp drops before it computes contacts.
             num_needed = jnp.maximum(data._impl.nacon, data._impl.ncollision)
             overflow |= (num_needed > data._impl.naconmax).any()
             lost_rows |= data._impl.nefc > data._impl.njmax
-        data = data.replace(ctrl=ctrl)
+        data = data.replace(ctrl=ctrl if ctrl.ndim == 2 else ctrl[:, -1])
         # Velocities diverge once constraint rows are lost, so the task must end these episodes as not finite.
-        state = state_of(data)
+        state = state_of(data, state.model_index)
         state = state._replace(qpos=jnp.where(lost_rows[:, None], jnp.nan, state.qpos))
         return state, self._read_after_step(data), overflow | lost_rows
 
-    def _used_control(self, ctrl: Float[Array, "B nu"]) -> Float[Array, "B nu"]:
+    def _used_control(self, ctrl: Float[Array, "B *substeps nu"]) -> Float[Array, "B *substeps nu"]:
         """The control, clipped for an implicit integrator. Warp clips it in forces, but not in their derivatives."""
         model = self._mj_model
         is_explicit = model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -146,9 +163,15 @@ def warp_device(device: jax.Device) -> wp.Device:
 
 def _over_batch(
     function: Callable[[mjx.Model, mjx.Data], mjx.Data], model: mjx.Model
-) -> Callable[[mjx.Data], mjx.Data]:
-    """Batch a function of MJX data.
+) -> Callable[[dict[str, Array], mjx.Data], mjx.Data]:
+    """Batch a function of changed values of a model, which may be none, and of MJX data.
 
     `jit` caches its trace. Tracing it in every substep would take a third of the tracing time of a training call.
     """
-    return jax.jit(jax.vmap(functools.partial(function, model)), inline=True)
+    return jax.jit(jax.vmap(functools.partial(_with_values, function, model)), inline=True)
+
+
+def _with_values(
+    function: Callable[[mjx.Model, mjx.Data], mjx.Data], model: mjx.Model, values: dict[str, Array], data: mjx.Data
+) -> mjx.Data:
+    return function(model.tree_replace(values) if values else model, data)

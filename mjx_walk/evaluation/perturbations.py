@@ -13,6 +13,8 @@ import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from jaxtyping import Float
 
+from mjx_walk.envs.randomization.edits import first_moving_body, scale_friction, scale_mass, scale_strength
+
 __all__ = ["Perturbation", "perturb"]
 
 _SECONDS_BETWEEN_PUSHES = 2.0
@@ -43,15 +45,11 @@ def perturb(env: MujocoEnv, perturbation: Perturbation, seed: int) -> None:
         seed: of the directions of the pushes.
     """
     model = env.model
-    model.geom_friction[:, 0] *= perturbation.friction
-    model.pair_friction[:, :2] *= perturbation.friction  # a pair has two sliding directions
+    scale_friction(model, perturbation.friction)
     if perturbation.mass != 1.0:
-        model.body_mass[:] *= perturbation.mass
-        model.body_inertia[:] *= perturbation.mass
+        scale_mass(model, perturbation.mass)
         mujoco.mj_setConst(model, mujoco.MjData(model))
-    for strength in (model.actuator_gainprm, model.actuator_biasprm):
-        strength[:, :3] *= perturbation.torque
-    model.actuator_forcerange[:] *= perturbation.torque
+    scale_strength(model, perturbation.torque)
     if perturbation.latency or perturbation.push:
         env.do_simulation = _Simulation(env, perturbation, seed).advance  # type: ignore[method-assign]
 
@@ -89,7 +87,7 @@ def _push(model: mujoco.MjModel, data: mujoco.MjData, velocity: float, angle: fl
         velocity: the impulse divided by the mass of the body and all its descendants, m/s.
         angle: direction of the impulse, rad. A body that moves along one horizontal axis gets its sign.
     """
-    body = int(np.flatnonzero(model.body_dofnum)[0])
+    body = first_moving_body(model)
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jac(model, data, jacobian, None, data.xipos[body], body)
     direction = np.array([math.cos(angle), math.sin(angle), 0.0])

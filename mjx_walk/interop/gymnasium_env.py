@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from mjx_walk.envs import NO_TIME_LIMIT, State, make_options
-from mjx_walk.envs.state import check_action_shape
+from mjx_walk.envs.state import check_action_shape, in_same_episode
 from mjx_walk.interop.compiled_env import CompiledEnv
 from mjx_walk.interop.gymnasium_info import single_info
 from mjx_walk.interop.gymnasium_programs import refuse_fork
@@ -93,8 +93,10 @@ class MjxWalkEnv(CompiledEnv, MujocoAttributes, gymnasium.Env):
     def _write_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
         refuse_fork()
         # As in Gymnasium, the solver's initial guess and activations stay.
-        kept = () if self._state is None else (self._state.physics.qacc_warmstart, self._state.physics.act)
-        self._state, _ = self._programs.reset_to(qpos, qvel, *kept)
+        old = self._state
+        kept = () if old is None else (old.physics.qacc_warmstart, old.physics.act)
+        new, _ = self._programs.reset_to(qpos, qvel, *kept)
+        self._state = new if old is None else in_same_episode(old, new)
 
     def __getstate__(self) -> dict[str, object]:
         return super().__getstate__() | {"_init": (self.init_qpos, self.init_qvel)}

@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from mjx_walk.envs import State
+from mjx_walk.envs.state import in_same_episode
 from mjx_walk.interop.mujoco_attributes import MujocoAttributes
 
 if TYPE_CHECKING:
@@ -64,7 +65,8 @@ class SubEnv(MujocoAttributes):
         env, i = self._vector_env, self._index
         if env._state is None:
             raise gymnasium.error.ResetNeeded("call reset before set_state")
-        _, _, warmstart, act = jax.tree.map(lambda x: x[i], env._state.physics)
-        new, _ = env._programs.reset_to(qpos, qvel, warmstart, act)  # as in Gymnasium, activations stay
-        new = new.replace(steps=env._state.steps[i])
+        old = jax.tree.map(lambda x: x[i], env._state)
+        # As in Gymnasium, activations stay.
+        new, _ = env._programs.reset_to(qpos, qvel, old.physics.qacc_warmstart, old.physics.act)
+        new = in_same_episode(old, new).replace(steps=old.steps)
         env._state = jax.tree.map(lambda x, y: x.at[i].set(y), env._state, new)

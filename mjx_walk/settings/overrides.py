@@ -12,6 +12,7 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
 from mjx_walk.machine.devices import default_backend
 from mjx_walk.settings.own_tasks import KEY, name_task
+from mjx_walk.settings.presets import with_presets
 from mjx_walk.settings.renamed import present_overrides
 from mjx_walk.settings.schema import chosen, setting_types, text_keys
 from mjx_walk.utils.errors import UserError
@@ -30,7 +31,7 @@ def read_overrides(overrides: list[str], is_sweep: bool = False) -> list[Overrid
     """Translate former names, quote text, add what follows from others, and refuse forms that bypass the schema.
 
     Without `hardware=` the size of the recipe follows from the devices that JAX sees. `env.task=` runs the file that it
-    names, and gives `env=`.
+    names, and gives `env=`. `env.randomize=default` gives the settings of that preset.
 
     Args:
         overrides: arguments of the command line.
@@ -39,7 +40,7 @@ def read_overrides(overrides: list[str], is_sweep: bool = False) -> list[Overrid
     Raises:
         UserError: `+key`, `++key` or `~key`, a malformed override, or an unknown environment or algorithm.
     """
-    overrides = _with_named_task(present_overrides(overrides))
+    overrides = _with_named_task(with_presets(present_overrides(overrides)))
     read = []
     for text in _in_hydras_grammar(overrides, is_sweep):
         override = _read(text)
