@@ -49,7 +49,7 @@ def test_every_page_is_listed(folder):
 
 def test_every_setting_has_a_meaning():
     schemas = importlib.import_module("generator.setting_tables").all_schemas()
-    assert len(schemas) == 5 + len(BUILT_IN_TASKS) + len(BUILT_IN_ALGORITHMS) + 2  # motors and weights of locomotion
+    assert len(schemas) == 6 + len(BUILT_IN_TASKS) + len(BUILT_IN_ALGORITHMS) + 2  # motors and weights of locomotion
     for schema in schemas:
         meanings = setting_fields.meanings(schema)
         missing = {row.name for row in setting_fields.table(schema)} - {*meanings, "name", "env", "algo"}

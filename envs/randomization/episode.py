@@ -115,7 +115,7 @@ class Randomizer:
             physics = self._pushed(physics, push_key, is_due)
             next_time = jnp.where(is_due, self._draw_push_steps(time_key), draws.push_steps - 1)
             draws = draws.replace(push_steps=next_time)
-        if draws.past_actions is None:
+        if draws.latency is None or draws.past_actions is None:
             return draws, physics, action
         actions = jnp.concatenate([action[None], draws.past_actions])
         steps_late = jnp.maximum(draws.latency - jnp.arange(self._num_substeps), 0)
