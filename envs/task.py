@@ -10,6 +10,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs import models
+from mjx_walk.envs.custom_reward import CustomReward
 from mjx_walk.envs.info import GymnasiumInfo
 from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.model_files import source_hashes
@@ -17,10 +18,9 @@ from mjx_walk.envs.motors import motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.randomization.episode import Randomizer
 from mjx_walk.envs.resets import InitialState
-from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping, shaping_terms, term_names
+from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping
 from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape, first_state, is_finite, physics_state
 from mjx_walk.envs.task_options import TaskOptions, check_version, with_absolute_paths
-from mjx_walk.envs.user_files import load_reward_function
 from mjx_walk.envs.view import View
 from mjx_walk.machine.compat import standard_dtypes
 from mjx_walk.storage.files import working_folder
@@ -93,8 +93,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         self.observation_size = sum(self.observation_blocks().values())
         self._motor_dofs = motor_dofs(self.model)
         self._check_shaping()
-        self._reward_function = load_reward_function(options.reward_function) if options.reward_function else None
-        self.reward_terms = self._reward_term_names()
+        self._custom_reward = CustomReward(options.reward_function, options.shaping, self._motor_dofs)
+        self.reward_terms = self._custom_reward.term_names(self._example_step())
         self.metric_names = (*self.reward_terms, "nonfinite", "overflow")
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -110,12 +110,12 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     @property
     def reward_hashes(self) -> dict[str, str]:
         """SHA-256 of the reward function's files, by absolute path; empty without a reward function."""
-        return self._reward_function.hashes if self._reward_function else {}
+        return self._custom_reward.hashes
 
     @property
     def has_custom_reward(self) -> bool:
         """Whether the reward differs from Gymnasium's."""
-        return self._reward_function is not None or any(vars(self.options.shaping).values())
+        return self._custom_reward.changes_reward
 
     # Defined by each task, up to `reset`.
 
@@ -250,7 +250,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         carry = self.next_carry(state, physics, derived, action) | self._kept(derived)
         obs = self.randomizer.observe(draws, self.observe_all(physics, derived, carry))
         terms, reward, terminated = self.reward_and_termination(state, physics, derived, carry, action)
-        terms, reward = self._customize_reward(
+        terms, reward = self._custom_reward(
             RewardStep(terms, reward, state.physics, physics, obs, action, terminated, self.dt)
         )
 
@@ -279,22 +279,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     def _kept(self, derived: Derived) -> Carry:
         return {name: derived[name] for name in self.kept_arrays}
 
-    def _customize_reward(self, step: RewardStep) -> tuple[Terms, Float[Array, ""]]:
-        """Reward terms and reward after `reward_function` and `shaping` are applied."""
-        terms, reward = step.terms, step.reward
-        if self._reward_function:
-            terms = {name: jnp.float32(term) for name, term in self._reward_function(step).items()}
-            reward = sum(terms.values(), jnp.float32(0.0))
-        added = shaping_terms(self.options.shaping, step, self._motor_dofs)
-        return terms | added, sum(added.values(), reward)
-
-    def _reward_term_names(self) -> tuple[str, ...]:
-        """Names of all reward terms, found by tracing `reward_function` on an example step."""
+    def _example_step(self) -> RewardStep:
         terms = dict.fromkeys(self.gymnasium_reward_terms, jnp.float32(0.0))
         physics = physics_state(self.model, self.init_qpos, self.init_qvel)
         obs, action = jnp.zeros(self.observation_size), jnp.zeros(self.action_size)
-        step = RewardStep(terms, jnp.float32(0.0), physics, physics, obs, action, jnp.zeros((), bool), self.dt)
-        names, shaped = tuple(terms), shaping_terms(self.options.shaping, step, self._motor_dofs)
-        if self._reward_function:
-            names = term_names(self._reward_function, str(self.options.reward_function), step, shaped)
-        return (*names, *shaped)
+        return RewardStep(terms, jnp.float32(0.0), physics, physics, obs, action, jnp.zeros((), bool), self.dt)

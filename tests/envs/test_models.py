@@ -13,6 +13,7 @@ from helpers import CLONE, TINY, train_here
 
 from mjx_walk.envs import GYMNASIUM_TASKS, TASKS, make_env
 from mjx_walk.envs.models import load_model
+from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.utils.errors import UserError
 
@@ -221,8 +222,8 @@ def test_a_model_that_overflows_in_its_own_pose_is_refused(tmp_path, old, new, n
 def test_threads_step_one_task_in_turn():
     """MuJoCo's work space is shared: two threads in it at once would end the process."""
     task = make_env("walker2d", physics="c")
-    state = [np.tile(np.asarray(x), (4, 1)) for x in (task.init_qpos, task.init_qvel, task.init_qvel)]
-    alone = task.engine._host_step(*state, np.zeros((4, 6)))
+    state = PhysicsState(*(np.tile(x, (4, 1)) for x in (task.init_qpos, task.init_qvel, task.init_qvel)))
+    alone = task.engine._host_step(state, np.zeros((4, 6)))
     turns, step_one = [], task.engine._step_one
 
     def counted(*arguments):
@@ -231,7 +232,7 @@ def test_threads_step_one_task_in_turn():
 
     task.engine._step_one = counted
     with ThreadPoolExecutor(3) as threads:
-        together = list(threads.map(lambda _: task.engine._host_step(*state, np.zeros((4, 6))), range(30)))
+        together = list(threads.map(lambda _: task.engine._host_step(state, np.zeros((4, 6))), range(30)))
     assert len(turns) == 120 and all(turns)
     for (qpos, *_), _, _ in together:
         np.testing.assert_array_equal(qpos, alone[0][0])
