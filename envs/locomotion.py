@@ -179,6 +179,15 @@ class Locomotion(Task):
         air_time = jnp.where(self._touches_floor(derived), 0.0, kept["air_time"] + self.dt)
         return command | {"last_action": (action - self._targets) / self.options.action_scale, "air_time": air_time}
 
+    def measures(self, before: State, after: State) -> dict[str, Float[Array, ""]]:
+        """Errors of the torso's velocity relative to the command under which the robot acted."""
+        command, physics = before.memory["command"], after.physics
+        velocity = in_body_frame(physics.qvel[:3], physics.qpos[3:7])
+        return {
+            "velocity error (m/s)": jnp.linalg.norm(velocity[:2] - command[:2]),
+            "turning error (rad/s)": jnp.abs(physics.qvel[5] - command[2]),
+        }
+
     def _new_command(self, key: PRNGKeyArray) -> Carry:
         """Draw a command and the number of steps for which it holds. The next key stays with them."""
         options = self.options
