@@ -22,6 +22,7 @@ from mjx_walk.envs.locomotion_rewards import (
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import Terms
+from mjx_walk.envs.robots.metadata import servo_metadata
 from mjx_walk.envs.robots.robot import load_robot
 from mjx_walk.envs.robots.servos import Motors
 from mjx_walk.envs.robots.surfaces import Surface, heights
@@ -117,6 +118,12 @@ class Locomotion(Task):
 
     def action_range(self) -> Float[np.ndarray, "2 action_size"]:
         return self.robot.targets + self.options.action_scale * np.array([[-1.0], [1.0]])
+
+    def export_metadata(self) -> dict[str, object]:
+        """The servos, the standing pose and the ranges of commands; see `servo_metadata`."""
+        forward, sideways, turning = self.options.forward_range, self.options.sideways_range, self.options.turning_range
+        ranges = {"forward": forward, "sideways": sideways, "turning": turning}
+        return servo_metadata(self.robot) | {"action_scale": self.options.action_scale, "command_ranges": ranges}
 
     @property
     def terminates_on_fall(self) -> bool:

@@ -153,5 +153,5 @@ def score_in_sim(task: Task, episodes: Episodes, num_episodes: int, seed: int = 
     name = f"{task.gymnasium_id} on {task.engine.name}"
     if measures and task.terminates_on_fall:
         measures["falls (%)"] = 100 * (lengths < task.max_episode_steps)
-    means = {measure: np.float64(values) for measure, values in measures.items()}
-    return Scores(np.float64(returns), np.int64(lengths), [seed], name, means)
+    means = {measure: np.asarray(values, np.float64) for measure, values in measures.items()}
+    return Scores(np.asarray(returns, np.float64), np.asarray(lengths, np.int64), [seed], name, means)

@@ -41,7 +41,7 @@ class Scores:
     env: str
     """Gymnasium's name, followed by the engine if it is not Gymnasium's."""
     measures: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """`[N] f64` each: the task's measures, as means over each episode, by name with unit. Gymnasium's tasks have none."""
+    """`[N] f64` each: means of the task's measures over an episode, by name with unit. Gymnasium's tasks have none."""
 
     @property
     def mean(self) -> float:
