@@ -18,7 +18,9 @@ _OF_SCORES = (
     *("best_evaluations", "complete_episodes", "cpu", "cpu_tasks"),
     *("mujoco_versions", "robustness", "slm_lab_drafts"),
 )
-"""Tables of measured/ that results.md shows. speed.md shows the others."""
+"""Tables of measured/ that results.md shows. speed.md shows the others, except that of robots."""
+_ROBOTS = "robots"
+"""The table of measured/ that your_own.md shows."""
 
 
 def pages() -> dict[Path, str]:
@@ -32,7 +34,7 @@ def pages() -> dict[Path, str]:
         found[DOCS / page] = _filled(page, blocks)
     found[DOCS / "training.md"] = _filled("training.md", {"scaling-summary": scaling.summary()})
     robots = {name: setting_tables.task_tables(name) for name in BUILT_IN_TASKS if name not in GYMNASIUM_TASKS}
-    found[DOCS / "your_own.md"] = _filled("your_own.md", robots)
+    found[DOCS / "your_own.md"] = _filled("your_own.md", robots | {_ROBOTS: measured_tables.all_in(".")[_ROBOTS]})
     groups["presets"] = setting_tables.presets()
     found[DOCS / "configuration.md"] = _filled("configuration.md", groups)
     texts = {name: (DOCS / "algorithms" / f"{name}.md").read_text() for name in BUILT_IN_ALGORITHMS}
@@ -53,6 +55,7 @@ def _figures() -> dict[str, dict[str, str]]:
     scores |= {"csac-seeds": seed_tables.csac_seeds(), "csac-means": seed_tables.csac_means()}
     scores |= {"fresh-seeds": seed_tables.other_algorithms(), "ppo-suite": seed_tables.ppo_on_other_tasks()}
     scores |= {name: measured.pop(name) for name in _OF_SCORES}
+    del measured[_ROBOTS]
     archived["six-algorithms"] = seed_tables.six_algorithms()
     speeds = {"scaling": scaling.detailed(), **measured}
     return {"results.md": scores, "speed.md": speeds, "results_archive.md": archived}

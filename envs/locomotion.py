@@ -22,6 +22,7 @@ from mjx_walk.envs.locomotion_rewards import (
 from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import Terms
+from mjx_walk.envs.robots.metadata import servo_metadata
 from mjx_walk.envs.robots.robot import load_robot
 from mjx_walk.envs.robots.servos import Motors
 from mjx_walk.envs.robots.surfaces import Surface, heights
@@ -118,6 +119,12 @@ class Locomotion(Task):
     def action_range(self) -> Float[np.ndarray, "2 action_size"]:
         return self.robot.targets + self.options.action_scale * np.array([[-1.0], [1.0]])
 
+    def export_metadata(self) -> dict[str, object]:
+        """The servos, the standing pose and the ranges of commands; see `servo_metadata`."""
+        forward, sideways, turning = self.options.forward_range, self.options.sideways_range, self.options.turning_range
+        ranges = {"forward": forward, "sideways": sideways, "turning": turning}
+        return servo_metadata(self.robot) | {"action_scale": self.options.action_scale, "command_ranges": ranges}
+
     @property
     def terminates_on_fall(self) -> bool:
         return True
@@ -178,6 +185,15 @@ class Locomotion(Task):
         command = {name: jnp.where(is_due, value, kept[name]) for name, value in drawn.items()}
         air_time = jnp.where(self._touches_floor(derived), 0.0, kept["air_time"] + self.dt)
         return command | {"last_action": (action - self._targets) / self.options.action_scale, "air_time": air_time}
+
+    def measures(self, before: State, after: State) -> dict[str, Float[Array, ""]]:
+        """Errors of the torso's velocity relative to the command under which the robot acted."""
+        command, physics = before.memory["command"], after.physics
+        velocity = in_body_frame(physics.qvel[:3], physics.qpos[3:7])
+        return {
+            "velocity error (m/s)": jnp.linalg.norm(velocity[:2] - command[:2]),
+            "turning error (rad/s)": jnp.abs(physics.qvel[5] - command[2]),
+        }
 
     def _new_command(self, key: PRNGKeyArray) -> Carry:
         """Draw a command and the number of steps for which it holds. The next key stays with them."""

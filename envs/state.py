@@ -155,6 +155,10 @@ class TrainableTask(Protocol):
         """Next state. Its metrics hold the reward terms, `nonfinite` and `overflow`."""
         ...
 
+    def measures(self, before: State, after: State) -> dict[str, Float[Array, ""]]:
+        """Quantities of a step, by name with unit. Scores show their means over episodes; the default has none."""
+        return {}
+
     def scale_action(self, action: Float[Array, "*batch action_size"]) -> Float[Array, "*batch action_size"]:
         """Actions in Gymnasium's units, from actions in [-1, 1]; values outside that range are clipped."""
         center = (self.action_high + self.action_low) / 2

@@ -128,6 +128,10 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         """Bodies that `observe`, `carry` and `reward_and_termination` read, as keys of `body_ids`."""
         return ()
 
+    def export_metadata(self) -> dict[str, object]:
+        """Facts, as for JSON, that a program without this package needs to use a policy. An ONNX file holds them."""
+        return {}
+
     def load_model(self) -> mujoco.MjModel:
         """The model of `model_file`. A task may complete it."""
         return models.load_model(self.model_file)

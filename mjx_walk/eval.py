@@ -64,7 +64,7 @@ def main(command_line: list[str]) -> None:
     if is_saved:
         parsing.check_writable(folder.gymnasium_scores)
     scores = run.evaluate(arguments.episodes or _EPISODES, arguments.backend, arguments.seed)
-    print(*score_lines({run.policy_name: (scores, run.policy_metadata["env_steps"])}))
+    print(*score_lines({run.policy_name: (scores, run.policy_metadata["env_steps"])}), sep="\n")
     if arguments.policy is None and len(kept_policies(folder)) > 1:
         print(choice_line(run.policy_name))
     if is_saved:

@@ -84,6 +84,7 @@ def _metadata(run: Run) -> dict[str, str]:
         "action_high": task.action_high.tolist(),
         "observation": task.observation_blocks(),
         "env_steps": run.policy_metadata["env_steps"],
+        **task.export_metadata(),
     }
     names = {"task": task.gymnasium_id, "algorithm": run.config.algo.name, "policy": run.policy_name}
     return (

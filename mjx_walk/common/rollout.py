@@ -70,7 +70,9 @@ def unroll(
 
 def evaluate(
     task: TrainableTask, num_episodes: int, policy: PolicyFn, key: PRNGKeyArray
-) -> tuple[Float[Array, " {num_episodes}"], Int32[Array, " {num_episodes}"]]:
+) -> tuple[
+    Float[Array, " {num_episodes}"], Int32[Array, " {num_episodes}"], dict[str, Float[Array, " {num_episodes}"]]
+]:
     """Play complete episodes in one batch, until the last of them has ended.
 
     Args:
@@ -80,24 +82,27 @@ def evaluate(
         key: for the starts and, if the policy samples, the actions.
 
     Returns:
-        Undiscounted returns, and lengths in steps.
+        Undiscounted returns; lengths in steps; and the means of the task's measures over the steps of each episode.
     """
     reset_key, run_key = jax.random.split(key)
     start = jax.vmap(task.reset)(jax.random.split(reset_key, num_episodes))
 
     def is_running(carry):
-        _, alive, _, _ = carry
+        _, alive, _, _, _ = carry
         return alive.any()
 
     def step(carry):
-        state, alive, returns, lengths = carry
+        before, alive, returns, lengths, sums = carry
         key = jax.random.fold_in(run_key, lengths.max())
-        state = jax.vmap(task.step)(state, policy(state.obs, key))
+        state = jax.vmap(task.step)(before, policy(before.obs, key))
         returns += jnp.where(alive, state.reward, 0.0)
+        measured = jax.vmap(task.measures)(before, state)
+        sums = {name: sums[name] + jnp.where(alive, value, 0.0) for name, value in measured.items()}
         lengths += alive
-        return state, alive & ~(state.terminated | state.truncated), returns, lengths
+        return state, alive & ~(state.terminated | state.truncated), returns, lengths, sums
 
     zeros = jnp.zeros(num_episodes, jnp.float32)
-    carry = (start, jnp.ones(num_episodes, bool), zeros, zeros.astype(jnp.int32))
-    _, _, returns, lengths = jax.lax.while_loop(is_running, step, carry)
-    return returns, lengths
+    sums = dict.fromkeys(jax.eval_shape(jax.vmap(task.measures), start, start), zeros)
+    carry = (start, jnp.ones(num_episodes, bool), zeros, zeros.astype(jnp.int32), sums)
+    _, _, returns, lengths, sums = jax.lax.while_loop(is_running, step, carry)
+    return returns, lengths, {name: value / lengths for name, value in sums.items()}

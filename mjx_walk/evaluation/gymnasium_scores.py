@@ -39,8 +39,8 @@ class ScoreRequest:
     seed: int = setting(0, at_least=0, at_most=MAX_SEED)
 
 
-Episodes = Callable[[jax.Array, int], tuple[jax.Array, jax.Array]]
-"""`key, N → returns [N] f32, lengths [N] i32`."""
+Episodes = Callable[[jax.Array, int], tuple[jax.Array, jax.Array, dict[str, jax.Array]]]
+"""`key, N → returns [N] f32, lengths [N] i32, means of the task's measures [N] f32`."""
 
 
 def score_in_gymnasium(task: Task, act: Act, num_episodes: int, seed: int = 0) -> Scores:
@@ -148,6 +148,10 @@ def score_in_sim(task: Task, episodes: Episodes, num_episodes: int, seed: int = 
         seed: of the starts.
     """
     with undisturbed("finishing the episodes"):
-        returns, lengths = jax.block_until_ready(episodes(jax.random.PRNGKey(seed), num_episodes))
+        found = jax.block_until_ready(episodes(jax.random.PRNGKey(seed), num_episodes))
+    returns, lengths, measures = jax.tree.map(np.asarray, found)
     name = f"{task.gymnasium_id} on {task.engine.name}"
-    return Scores(np.asarray(returns, np.float64), np.asarray(lengths, np.int64), [seed], name)
+    if measures and task.terminates_on_fall:
+        measures["falls (%)"] = 100 * (lengths < task.max_episode_steps)
+    means = {measure: np.asarray(values, np.float64) for measure, values in measures.items()}
+    return Scores(np.asarray(returns, np.float64), np.asarray(lengths, np.int64), [seed], name, means)

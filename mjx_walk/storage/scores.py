@@ -40,6 +40,8 @@ class Scores:
     """In Gymnasium the seed of each episode's reset; in an engine the one seed of all episodes."""
     env: str
     """Gymnasium's name, followed by the engine if it is not Gymnasium's."""
+    measures: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """`[N] f64` each: means of the task's measures over an episode, by name with unit. Gymnasium's tasks have none."""
 
     @property
     def mean(self) -> float:
@@ -57,13 +59,18 @@ class Scores:
             f"mean length {self.lengths.mean():,.1f}, lowest {self.returns.min():,.1f}"
         )
 
+    @property
+    def measures_line(self) -> str:
+        """Means of the measures over episodes; empty without measures."""
+        return ", ".join(f"{name}: {values.mean():.3g}" for name, values in self.measures.items())
+
     def block(self, **metadata: Unpack[Metadata]) -> "ScoreBlock":
         """All episodes and their mean and deviation, for `write_scores`.
 
         Args:
             metadata: facts about the policy, such as `env_steps`.
         """
-        return {
+        found: ScoreBlock = {
             "mean": self.mean,
             "std": self.std,
             "returns": self.returns.tolist(),
@@ -71,6 +78,9 @@ class Scores:
             "seeds": self.seeds,
             **metadata,
         }
+        if self.measures:
+            found["measures"] = {name: values.tolist() for name, values in self.measures.items()}
+        return found
 
 
 class ScoreBlock(Metadata, total=False):
@@ -83,6 +93,8 @@ class ScoreBlock(Metadata, total=False):
     returns: list[float]
     lengths: list[int]
     seeds: list[int]
+    measures: dict[str, list[float]]
+    """Absent without measures."""
 
 
 @dataclasses.dataclass(frozen=True)

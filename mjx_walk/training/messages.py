@@ -52,7 +52,7 @@ def announce(config: Config, folders: list[RunFolder], num_devices: int) -> None
 def score_lines(
     scored: Mapping[str, tuple[Scores, int]], total_steps: int | None = None, seed: int | None = None
 ) -> list[str]:
-    """One line for each scored policy.
+    """One line for each scored policy, followed by one with its measures if it has any.
 
     Args:
         scored: scores and environment steps of each policy, by its name.
@@ -61,8 +61,13 @@ def score_lines(
     """
     whose = "" if seed is None else f"seed {seed}, "
     end = "" if total_steps is None else f" of {total_steps:,}"
-    lines = (f"{whose}{name} policy (step {steps:,}{end}), {scores}" for name, (scores, steps) in scored.items())
-    return [line[0].upper() + line[1:] for line in lines]
+    lines = []
+    for name, (scores, steps) in scored.items():
+        line = f"{whose}{name} policy (step {steps:,}{end}), {scores}"
+        lines.append(line[0].upper() + line[1:])
+        if scores.measures:
+            lines.append(f"  {scores.measures_line}")
+    return lines
 
 
 def choice_line(taken: str) -> str:

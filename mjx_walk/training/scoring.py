@@ -54,7 +54,7 @@ def final_and_best(
 
 def _mean_return(algorithm: Algorithm, policy_params: PolicyParams, key: jax.Array) -> jax.Array:
     """Mean return of a policy in as many environments as the inline evaluation has."""
-    returns, _ = evaluate(algorithm.task, algorithm.evaluator.num_envs, algorithm.policy(policy_params), key)
+    returns, *_ = evaluate(algorithm.task, algorithm.evaluator.num_envs, algorithm.policy(policy_params), key)
     return returns.mean()
 
 

@@ -1,6 +1,8 @@
 """The task of a robot that follows commanded velocities: observation, commands, reward, falls, and its engines."""
 
+import importlib.util
 import json
+import re
 from pathlib import Path
 
 import gymnasium
@@ -9,15 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 import onnx
 import pytest
-from helpers import OPTIMIZED, TINY, TINY_CALL, command_here, leaves, train_here
+from helpers import CLONE, OPTIMIZED, TINY, TINY_CALL, command_here, leaves, train_here
 from scipy.spatial.transform import Rotation
 from small_robot import small_robot, write
 
+import mjx_walk
 from mjx_walk.envs import make_env
 from mjx_walk.evaluation import engine_parity
+from mjx_walk.evaluation.gymnasium_scores import compile_episodes, score_in_sim
+from mjx_walk.storage.scores import read_scores
 from mjx_walk.utils.errors import UserError
 
 SERVOS, FEET = 8, 4
+LINE = r" *turning error \(rad/s\): [\d.]+, velocity error \(m/s\): [\d.]+, falls \(%\): [\d.]+"
+_SPEC = importlib.util.spec_from_file_location("run_robot", CLONE / "docs" / "examples" / "run_robot.py")
+run_robot = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(run_robot)
 
 
 @pytest.fixture(scope="module")
@@ -191,12 +200,74 @@ def test_a_run_is_trained_resumed_scored_and_exported(tmp_path, monkeypatch, pat
     assert whole.keys() == parts.keys() and sum("command" in name for name in whole) >= 2
     for name, leaf in whole.items():
         np.testing.assert_array_equal(leaf, parts[name], err_msg=name)
-    assert command_here("eval", "run=parts", "episodes=2") == 0 and "locomotion on c" in capsys.readouterr().out
+    assert command_here("eval", "run=parts", "episodes=2") == 0
+    *_, score, measures, _ = capsys.readouterr().out.splitlines()
+    assert "locomotion on c" in score and re.fullmatch(LINE, measures)
+    block = read_scores(tmp_path / "parts" / "eval_gymnasium.json").block("final")
+    assert {len(values) for values in block["measures"].values()} == {2}
     assert command_here("export", "run=parts", "format=onnx", "out=policy.onnx") == 0
     facts = {prop.key: prop.value for prop in onnx.load(tmp_path / "policy.onnx").metadata_props}
     keywords = json.loads(facts["keywords"])
     assert keywords["weights"]["pose"] == 0.4 and keywords["xml_file"] == Path(path).name
     assert facts["task"] == "locomotion" and len(json.loads(facts["motors"])) == SERVOS
+    assert json.loads(facts["command_ranges"])["sideways"] == [-0.5, 0.5]
+    assert_program_equals(mjx_walk.load_run("parts", "c"), "policy.onnx", path)
+
+
+def assert_program_equals(run, policy_path, model_path):
+    """The example of the documentation gives the observations and states of the task."""
+    task, command = run.task, np.array([0.5, -0.2, 0.3], np.float32)
+    state = task.reset_to(task.init_qpos, task.init_qvel)
+    state = state.replace(memory=state.memory | {"command": command, "command_steps": np.int32(100)})
+    state, step = state.replace(obs=state.obs.at[-3:].set(command)), jax.jit(task.step)
+    for obs, data in run_robot.walk(policy_path, model_path, command, num_steps=25):
+        np.testing.assert_allclose(obs, state.obs, atol=1e-3)
+        state = step(state, run.policy(state.obs))
+        np.testing.assert_allclose(data.qpos, state.physics.qpos, atol=1e-4)
+    assert np.abs(state.obs[6 : 6 + SERVOS]).max() > 0.01  # it moved
+
+
+ACTUATORS = ("", 'motor gear="3" ctrlrange="-5 5"', 'position kp="20" kv="0.5" ctrlrange="-2 2"')
+
+
+@pytest.mark.parametrize("actuator", ACTUATORS)
+def test_the_example_program_simulates_the_robot_of_the_task(tmp_path, actuator):
+    """A file without motors, with torques, and with servos of its own."""
+    xml = write(tmp_path, small_robot(actuator=actuator))
+    task = make_env("locomotion", physics="c", xml_file=xml)
+    found = run_robot.load_model(xml, json.loads(json.dumps(task.export_metadata())))
+    for name in ("actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange", "actuator_forcerange", "actuator_gear"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(task.model, name), err_msg=name)
+    for name in ("actuator_forcelimited", "actuator_trnid", "dof_armature", "body_mass", "geom_type", "geom_contype"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(task.model, name), err_msg=name)
+
+
+def test_errors_are_those_of_the_command_under_which_the_robot_acted(task, step):
+    rotation = Rotation.from_euler("xyz", [0.1, 0.2, 0.7])
+    before = at(task, height=0.3, rotation=rotation, velocity=[0.5, -0.3, 0.2, 0.3, -0.2, 0.4])
+    before = before.replace(memory=before.memory | {"command": jnp.array([1.0, 0.5, -1.0]), "command_steps": 0})
+    after = step(before, stand(task))
+    assert (after.memory["command"] != before.memory["command"]).any()
+    found = task.measures(before, after)
+    local = Rotation.from_quat(after.physics.qpos[3:7], scalar_first=True).inv().apply(after.physics.qvel[:3])
+    np.testing.assert_allclose(found["velocity error (m/s)"], np.hypot(local[0] - 1.0, local[1] - 0.5), rtol=1e-4)
+    np.testing.assert_allclose(found["turning error (rad/s)"], after.physics.qvel[5] + 1.0, rtol=1e-5)
+
+
+def test_scores_hold_the_means_of_the_errors_and_the_falls(path):
+    """One robot stands until the time limit; the others fall when they are let go, each after some steps."""
+    task = make_env("locomotion", physics="c", xml_file=path, max_episode_steps=40, zero_command_probability=1.0)
+
+    def policy(obs, key):
+        falls = jnp.arange(len(obs))[:, None] > 0
+        return jnp.where(falls, stand(task) + jnp.tile(jnp.array([3.0, 0.0]), 4), stand(task))
+
+    scores = score_in_sim(task, compile_episodes(task, policy), num_episodes=3)
+    assert scores.lengths[0] == 40 and (scores.lengths[1:] < 40).all()
+    assert scores.measures["falls (%)"].tolist() == [0, 100, 100]
+    errors = scores.measures["velocity error (m/s)"]
+    assert errors[0] < 0.2 and (errors[1:] > errors[0]).all() and errors.max() < 3
+    assert re.fullmatch(LINE, scores.measures_line) and "falls (%): 66.7" in scores.measures_line
 
 
 @pytest.mark.slow
