@@ -64,7 +64,7 @@ class PPO(OnPolicyAlgorithm[PPOConfig]):
         entropy_coef: Float[Array, ""] | float,
         reward_scale: Float[Array, ""],
     ) -> tuple[Float[Array, ""], Losses]:
-        """The loss of a minibatch `[N, T, …]`, and Brax's metrics."""
+        """The loss of a minibatch `[N, T, …]`, and Brax's metrics. `docs/algorithms/ppo.md` has the formula."""
         brax_loss = make_ppo_loss(self.nets, self.config, entropy_coef, reward_scale)
         return brax_loss(params, normalizer, transitions, key)
 
@@ -111,9 +111,7 @@ class PPO(OnPolicyAlgorithm[PPOConfig]):
         )
 
 
-def _loss_metrics(
-    metrics: dict[str, Float[Array, "epochs minibatches"]],
-) -> Losses:
+def _loss_metrics(metrics: dict[str, Float[Array, "epochs minibatches"]]) -> Losses:
     """Means of Brax's metrics over all minibatches, under our names."""
     names = {
         "total_loss": "loss",
