@@ -54,7 +54,7 @@ def test_every_recipe_fits(recipe):
     config = load_recipe(recipe)
     assert (config.hardware, config.env.name, config.algo.name) == parts_of(recipe)
     if any(getattr(config.algo, name, None) not in (None, "constant") for name in SCHEDULES):
-        assert config.algo.schedule_steps == LONGER_SCHEDULES.get(recipe, config.total_steps)
+        assert config.algo.schedule_steps == LONGER_SCHEDULES.get(fallback(recipe) or recipe, config.total_steps)
     algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
     assert algorithm.steps_per_iteration * config.iterations_per_call < config.total_steps / 20
 
