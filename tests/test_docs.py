@@ -1,5 +1,6 @@
 """The generated parts of the documentation."""
 
+import dataclasses
 import importlib
 import os
 import re
@@ -8,8 +9,9 @@ from pathlib import Path
 import pytest
 from helpers import CLONE
 
-from mjx_walk.algos import BUILT_IN_ALGORITHMS
-from mjx_walk.envs import BUILT_IN_TASKS, TASKS
+from mjx_walk.algos import ALGORITHMS, BUILT_IN_ALGORITHMS
+from mjx_walk.envs import TASKS
+from mjx_walk.settings.config import Config
 from mjx_walk.utils import setting_fields
 
 DOCS = CLONE / "docs"
@@ -53,8 +55,10 @@ def test_every_page_is_listed(folder):
 
 def test_every_setting_has_a_meaning():
     schemas = importlib.import_module("generator.setting_tables").all_schemas()
-    assert len(schemas) == 6 + len(BUILT_IN_TASKS) + len(BUILT_IN_ALGORITHMS) + 2  # motors and weights of locomotion
+    assert {*schemas} >= {schema for _, schema in (*TASKS.values(), *ALGORITHMS.values())} | {Config}
     for schema in schemas:
+        groups = [field.default_factory for field in dataclasses.fields(schema)]
+        assert {*schemas} >= {group for group in groups if dataclasses.is_dataclass(group)}, schema.__name__
         meanings = setting_fields.meanings(schema)
         missing = {row.name for row in setting_fields.table(schema)} - {*meanings, "name", "env", "algo"}
         assert not missing, schema.__name__
