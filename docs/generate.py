@@ -11,7 +11,7 @@ from generator.markdown import toctree, with_block
 
 from mjx_walk import zoo
 from mjx_walk.algos import BUILT_IN_ALGORITHMS
-from mjx_walk.envs import BUILT_IN_TASKS, GYMNASIUM_TASKS
+from mjx_walk.envs import BUILT_IN_TASKS
 
 DOCS = Path(__file__).parent
 _OF_SCORES = (
@@ -25,15 +25,15 @@ _ROBOTS = "robots"
 
 def pages() -> dict[Path, str]:
     """Every page with generated parts, as it must be, by its path."""
-    found = {DOCS / "tasks" / f"{name}.md": task_pages.page(name) for name in GYMNASIUM_TASKS}
-    index = {"tasks": task_pages.overview_of_all(), "pages": toctree(GYMNASIUM_TASKS)}
+    found = {DOCS / "tasks" / f"{name}.md": task_pages.page(name) for name in task_pages.NAMES}
+    index = {"tasks": task_pages.overview_of_all(), "pages": toctree(task_pages.NAMES)}
     found[DOCS / "tasks" / "index.md"] = _filled("tasks/index.md", index)
     groups = {name: setting_tables.group_table(name) for name in setting_tables.GROUPS}
     found[DOCS.parent / "README.md"] = _filled("../README.md", {"best": best_recipes.summary()})
     for page, blocks in _figures().items():
         found[DOCS / page] = _filled(page, blocks)
     found[DOCS / "training.md"] = _filled("training.md", {"scaling-summary": scaling.summary()})
-    robots = {name: setting_tables.task_tables(name) for name in BUILT_IN_TASKS if name not in GYMNASIUM_TASKS}
+    robots = {name: setting_tables.task_tables(name) for name in BUILT_IN_TASKS if name not in task_pages.NAMES}
     found[DOCS / "your_own.md"] = _filled("your_own.md", robots | {_ROBOTS: measured_tables.all_in(".")[_ROBOTS]})
     groups["presets"] = setting_tables.presets()
     found[DOCS / "configuration.md"] = _filled("configuration.md", groups)
@@ -65,7 +65,10 @@ def _filled(name: str, blocks: dict[str, str]) -> str:
     """A handwritten page with its generated blocks."""
     page = (DOCS / name).read_text()
     for block, content in blocks.items():
-        page = with_block(page, block, content)
+        try:
+            page = with_block(page, block, content)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
     return page
 
 

@@ -1,5 +1,6 @@
 """The generated parts of the documentation."""
 
+import dataclasses
 import importlib
 import os
 import re
@@ -8,8 +9,9 @@ from pathlib import Path
 import pytest
 from helpers import CLONE
 
-from mjx_walk.algos import BUILT_IN_ALGORITHMS
-from mjx_walk.envs import BUILT_IN_TASKS, GYMNASIUM_TASKS, TASKS
+from mjx_walk.algos import ALGORITHMS, BUILT_IN_ALGORITHMS
+from mjx_walk.envs import TASKS
+from mjx_walk.settings.config import Config
 from mjx_walk.utils import setting_fields
 
 DOCS = CLONE / "docs"
@@ -20,6 +22,10 @@ def _generator_on_path(monkeypatch):
     monkeypatch.syspath_prepend(str(DOCS))
 
 
+def tasks_with_pages():
+    return importlib.import_module("generator.task_pages").NAMES
+
+
 def test_committed_pages_are_what_the_code_gives():
     pages = importlib.import_module("generate").pages()
     stale = [str(path.relative_to(CLONE)) for path, text in pages.items() if path.read_text() != text]
@@ -27,7 +33,7 @@ def test_committed_pages_are_what_the_code_gives():
     names = {Path(os.path.relpath(path, DOCS)).as_posix() for path in pages}
     assert names == {
         *("../README.md", "results.md", "results_archive.md", "speed.md", "training.md"),
-        *(f"tasks/{name}.md" for name in ("index", *GYMNASIUM_TASKS)),
+        *(f"tasks/{name}.md" for name in ("index", *tasks_with_pages())),
         *(f"algorithms/{name}.md" for name in ("index", *BUILT_IN_ALGORITHMS)),
         *("configuration.md", "your_own.md"),
     }
@@ -49,8 +55,10 @@ def test_every_page_is_listed(folder):
 
 def test_every_setting_has_a_meaning():
     schemas = importlib.import_module("generator.setting_tables").all_schemas()
-    assert len(schemas) == 6 + len(BUILT_IN_TASKS) + len(BUILT_IN_ALGORITHMS) + 2  # motors and weights of locomotion
+    assert {*schemas} >= {schema for _, schema in (*TASKS.values(), *ALGORITHMS.values())} | {Config}
     for schema in schemas:
+        groups = [field.default_factory for field in dataclasses.fields(schema)]
+        assert {*schemas} >= {group for group in groups if dataclasses.is_dataclass(group)}, schema.__name__
         meanings = setting_fields.meanings(schema)
         missing = {row.name for row in setting_fields.table(schema)} - {*meanings, "name", "env", "algo"}
         assert not missing, schema.__name__
@@ -59,6 +67,6 @@ def test_every_setting_has_a_meaning():
 
 def test_every_reward_term_has_its_words():
     texts = importlib.import_module("generator.task_texts").TEXTS
-    assert texts.keys() == {*GYMNASIUM_TASKS}
+    assert texts.keys() == {*tasks_with_pages()}
     for name, text in texts.items():
         assert text.rewards.keys() == {term for terms in TASKS[name][0].REWARD_TERMS.values() for term in terms}

@@ -15,6 +15,7 @@ from helpers import OLD_RUNS, renders
 
 import mjx_walk
 from mjx_walk import compare, play, zoo
+from mjx_walk.algos import ALGORITHMS
 from mjx_walk.cli import parsing
 from mjx_walk.envs import GYMNASIUM_TASKS, TASKS
 from mjx_walk.settings.config import load_config
@@ -27,6 +28,9 @@ SLIDES = '<joint type="slide"/><joint type="slide" axis="0 1 0"/><joint axis="0 
 LISTS = {
     "envs": ", ".join(TASKS),
     "gymnasium_envs": ", ".join(GYMNASIUM_TASKS),
+    "algos": ", ".join(ALGORITHMS),
+    "algos_with_minibatches": ", ".join(n for n, (_, c) in ALGORITHMS.items() if hasattr(c, "num_minibatches")),
+    "envs_with_contact_cost": ", ".join(n for n, (_, c) in TASKS.items() if hasattr(c, "contact_cost_weight")),
     "policies": ", ".join(zoo.names()),
 }
 NAMES = {name: getattr(mjx_walk, name) for name in ("BraxEnv", "load_run", "make_env", "register_task", "run")}

@@ -10,10 +10,12 @@ from generator.observations import clipped_to, entries
 from generator.setting_tables import GROUPS, settings_table
 from generator.task_texts import TEXTS, TaskText
 from mjx_walk import zoo
-from mjx_walk.envs import GYMNASIUM_TASKS, TASKS, Task, make_env
+from mjx_walk.envs import BUILT_IN_TASKS, TASKS, Task, make_env
 from mjx_walk.utils import setting_fields
 
 PAGES = Path(__file__).parents[1] / "tasks"
+NAMES = tuple(name for name in BUILT_IN_TASKS if TASKS[name][0].XML_FILES["v5"])
+"""Tasks with a page: those of this package that have a model of their own."""
 
 
 def page(name: str) -> str:
@@ -21,8 +23,8 @@ def page(name: str) -> str:
     tasks = versions(name)
     task, text = tasks["v5"], TEXTS[name]
     parts = [
-        f"# {task.GYMNASIUM_NAME}",
-        f"{text.goal} It is Gymnasium's `{task.gymnasium_id}`. Numbers and tables are for v5.",
+        f"# {type(task).__name__}",
+        f"{text.goal} {_equivalent(task)}",
         *_picture(name, text),
         f"```\npython -m mjx_walk.train env={name}\n```",
         *_shipped_policies(name),
@@ -37,12 +39,18 @@ def page(name: str) -> str:
         _episodes(task, text),
         "## Options",
         _options(name),
-        "## Differences of v4",
-        _differences(tasks, text),
+        *(["## Differences of v4", _differences(tasks, text)] if task.is_in_gymnasium else []),
     ]
     source = type(task).__module__.rpartition(".")[2]
     parts.append(f"Source: [`envs/{source}.py`](../../envs/{source}.py).")
     return "\n\n".join(parts) + "\n"
+
+
+def _equivalent(task: Task) -> str:
+    """The task's equivalent in Gymnasium, in a sentence."""
+    if task.is_in_gymnasium:
+        return f"It is Gymnasium's `{task.gymnasium_id}`. Numbers and tables are for v5."
+    return "Gymnasium has no equivalent."
 
 
 def versions(name: str) -> dict[str, Task]:
@@ -53,11 +61,11 @@ def versions(name: str) -> dict[str, Task]:
 def overview_of_all() -> str:
     """The table of all tasks."""
     rows = []
-    for name in GYMNASIUM_TASKS:
+    for name in NAMES:
         tasks = versions(name)
         task = tasks["v5"]
         sizes = (task.observation_size, task.action_size, f"{task.max_episode_steps:,}")
-        title = f"[{task.GYMNASIUM_NAME}]({name}.md)"
+        title = f"[{type(task).__name__}]({name}.md)"
         rows.append([title, code(name), ", ".join(tasks), *sizes, _integrator(task)])
     titles = ["Task", "`env=`", "Versions", ">Observations", ">Actions", ">Steps per episode", "Integrator"]
     return table(titles, rows)
@@ -79,9 +87,10 @@ def _integrator(task: Task) -> str:
 
 
 def _overview(tasks: dict[str, Task]) -> str:
+    is_in_gymnasium = tasks["v5"].is_in_gymnasium
     rows = [
         ("Name on the command line", lambda task: code(f"env={task.options.name}")),
-        ("Name in Gymnasium", lambda task: code(f"mjx_walk/{task.gymnasium_id}")),
+        *([("Name in Gymnasium", lambda task: code(f"mjx_walk/{task.gymnasium_id}"))] if is_in_gymnasium else []),
         ("Model", lambda task: code(task.XML_FILES[task.options.version])),
         ("Observation size", lambda task: task.observation_size),
         ("Action size", lambda task: task.action_size),

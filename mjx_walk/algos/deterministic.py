@@ -75,11 +75,7 @@ class DeterministicAlgorithm(OffPolicyAlgorithm[DeterministicState, _Determinist
         config = self.config
         policy, critic = networks.make_deterministic_networks(self.task, config, self.num_critics)
         noise = jnp.linspace(config.min_exploration_noise, config.max_exploration_noise, self.num_envs)[:, None]
-        self._set(
-            policy_network=policy,
-            critic_network=critic,
-            exploration_noise=noise,
-        )
+        self._set(policy_network=policy, critic_network=critic, exploration_noise=noise)
 
     @property
     def target_noise(self) -> tuple[float, float]:

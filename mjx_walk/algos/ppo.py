@@ -1,13 +1,15 @@
 """Proximal policy optimization (Schulman et al. 2017) on Brax's networks and loss."""
 
 import dataclasses
+import functools
 import math
 
 import jax
 import jax.numpy as jnp
 import optax
+from brax.training.acme.running_statistics import RunningStatisticsState
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, PRNGKeyArray
 
 from mjx_walk.algos.on_policy import (
     OnPolicyAlgorithm,
@@ -16,11 +18,11 @@ from mjx_walk.algos.on_policy import (
     require_several_gradient_steps,
 )
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
-from mjx_walk.common.brax_losses import make_ppo_loss
+from mjx_walk.common.brax_losses import PPOParams, make_ppo_loss
 from mjx_walk.common.optimizers import schedule_factor
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import setting
-from mjx_walk.utils.types import Losses, Metrics, as_means
+from mjx_walk.utils.types import Losses, Metrics, Transition, as_means
 
 __all__ = ["PPO", "PPOConfig"]
 
@@ -53,6 +55,19 @@ class PPO(OnPolicyAlgorithm[PPOConfig]):
         require_several_gradient_steps(self.config, self.config.num_epochs * self.config.num_minibatches)
         super().__post_init__()
 
+    def loss(
+        self,
+        params: PPOParams,
+        normalizer: RunningStatisticsState,
+        transitions: Transition,
+        key: PRNGKeyArray,
+        entropy_coef: Float[Array, ""] | float,
+        reward_scale: Float[Array, ""],
+    ) -> tuple[Float[Array, ""], Losses]:
+        """The loss of a minibatch `[N, T, …]`, and Brax's metrics. `docs/algorithms/ppo.md` has the formula."""
+        brax_loss = make_ppo_loss(self.nets, self.config, entropy_coef, reward_scale)
+        return brax_loss(params, normalizer, transitions, key)
+
     def update(self, state: OnPolicyState, batch: OnPolicyBatch) -> tuple[OnPolicyState, Metrics]:
         config = self.config
         key, update_key = jax.random.split(state.key)
@@ -62,7 +77,7 @@ class PPO(OnPolicyAlgorithm[PPOConfig]):
         # KL compares distributions under one normalizer, the one that acted.
         normalizer = state.normalizer if config.learning_rate_schedule == "adaptive_kl" else new_normalizer
         entropy_coef = config.entropy_coef * schedule_factor(config.entropy_schedule, remaining)
-        loss_fn = make_ppo_loss(self.nets, config, entropy_coef, batch.reward_scale)
+        loss_fn = functools.partial(self.loss, entropy_coef=entropy_coef, reward_scale=batch.reward_scale)
 
         def minibatch(carry, rows):
             params, opt_state, key = carry
@@ -96,9 +111,7 @@ class PPO(OnPolicyAlgorithm[PPOConfig]):
         )
 
 
-def _loss_metrics(
-    metrics: dict[str, Float[Array, "epochs minibatches"]],
-) -> Losses:
+def _loss_metrics(metrics: dict[str, Float[Array, "epochs minibatches"]]) -> Losses:
     """Means of Brax's metrics over all minibatches, under our names."""
     names = {
         "total_loss": "loss",

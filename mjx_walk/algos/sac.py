@@ -117,8 +117,8 @@ class SAC(OffPolicyAlgorithm[SACState, SACConfig]):
         return losses.critic(critic, learner.policy, learner.target_critic, alpha, batch.transitions, key), {}
 
     def critic_update(self, learner: SACState, batch: Batch, key: PRNGKeyArray) -> tuple[SACState, Losses]:
-        of_critics = jax.value_and_grad(self.critic_loss, has_aux=True)
-        (loss, metrics), grads = of_critics(learner.critic, learner, batch, key)
+        loss_and_grads = jax.value_and_grad(self.critic_loss, has_aux=True)
+        (loss, metrics), grads = loss_and_grads(learner.critic, learner, batch, key)
         rate = self.config.critic_learning_rate * batch.rate_factor
         critic, critic_optimizer = self.apply_gradients(learner.critic, grads, learner.critic_optimizer, rate)
         new_learner = learner.replace(

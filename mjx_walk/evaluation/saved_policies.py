@@ -34,7 +34,6 @@ __all__ = [
     "in_float32",
     "kept_policies",
     "load_policy",
-    "make_acting_algorithm",
     "make_task",
 ]
 
@@ -71,9 +70,9 @@ class SavedPolicy:
         self.policy_params, self.policy_metadata = _load(folder, self.policy_name, self.algorithm)
 
     def _build(self) -> None:
-        engine = self._physics or _engine_here(self.config.physics)
-        self.task = make_task(dataclasses.replace(self.config, physics=engine))
-        self.algorithm = make_acting_algorithm(self.task, self.config)
+        config, engine = self.config, self._physics or _engine_here(self.config.physics)
+        self.task = make_task(dataclasses.replace(config, physics=engine))
+        self.algorithm = in_float32(make_algorithm(self.task, config.num_envs, config.evaluation, config.algo))
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle and copy the parameters, without compiled functions."""
@@ -115,14 +114,8 @@ def make_task(config: Config) -> Task:
     return TASKS[config.env.name][0](config.env, config.physics)
 
 
-def make_acting_algorithm(task: Task, config: Config) -> Algorithm:
-    """The algorithm of a configuration, in float32: a policy then acts alike on every machine."""
-    algo = dataclasses.replace(config.algo, network_dtype="float32")
-    return make_algorithm(task, config.num_envs, config.evaluation, algo)
-
-
 def in_float32(algorithm: Algorithm) -> Algorithm:
-    """The algorithm itself if its networks are in float32; otherwise one that acts as `make_acting_algorithm`'s."""
+    """The algorithm with networks in float32, whose policies act alike on every machine."""
     if algorithm.config.network_dtype == "float32":
         return algorithm
     return dataclasses.replace(algorithm, config=dataclasses.replace(algorithm.config, network_dtype="float32"))

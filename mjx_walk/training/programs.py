@@ -40,8 +40,8 @@ class Program(Protocol):
         """The state before the first iteration, from the key of each run."""
         ...
 
-    def step(self, state: TrainState) -> tuple[TrainState, list[Metrics]]:
-        """Run the iterations of one call, and wait for them. It consumes the state.
+    def run_call(self, state: TrainState) -> tuple[TrainState, list[Metrics]]:
+        """Collect and learn in each iteration of a call, and wait for the last one. It consumes the state.
 
         Returns:
             The new state, and the metrics of each run, on the host, `[iterations]` each.
@@ -49,7 +49,7 @@ class Program(Protocol):
         ...
 
     def lower(self, keys: list[jax.Array], restored: TrainState | None) -> list[jax.stages.Lowered]:
-        """Trace the programs of `step`, and without a restored state also that of `init`.
+        """Trace the programs of `run_call`, and without a restored state also that of `init`.
 
         Once they are compiled, a call does not compile them again. A program may leave out what it cannot trace yet.
         """
@@ -93,7 +93,7 @@ class SingleProgram:
     def init(self, keys: list[jax.Array]) -> TrainState:
         return self._init(keys[0])
 
-    def step(self, state: TrainState) -> tuple[TrainState, list[Metrics]]:
+    def run_call(self, state: TrainState) -> tuple[TrainState, list[Metrics]]:
         state, metrics = self._step(state)
         return state, [jax.device_get(metrics)]
 
@@ -121,7 +121,7 @@ class SeedsProgram:
     def init(self, keys: list[jax.Array]) -> TrainState:
         return self._init(jnp.stack(keys))
 
-    def step(self, state: TrainState) -> tuple[TrainState, list[Metrics]]:
+    def run_call(self, state: TrainState) -> tuple[TrainState, list[Metrics]]:
         state, metrics = self._step(state)
         return state, _unstack(metrics, axis=1)
 
@@ -148,7 +148,7 @@ class DevicesProgram:
     def init(self, keys: list[jax.Array]) -> TrainState:
         return self._init(keys[0])
 
-    def step(self, state: TrainState) -> tuple[TrainState, list[Metrics]]:
+    def run_call(self, state: TrainState) -> tuple[TrainState, list[Metrics]]:
         state, metrics = self._step(state)
         return state, _unstack(metrics)
 

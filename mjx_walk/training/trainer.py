@@ -69,7 +69,7 @@ class Trainer:
         self._steps_per_iteration = algorithm.steps_per_iteration * processes.process_count
         self._steps_per_call = self._steps_per_iteration * config.iterations_per_call
         self._first_steps = 0
-        """Environment steps that do not fill a call, on another number of devices before a resume."""
+        """Environment steps before a resume that are no multiple of a call, because the number of devices differed."""
         self._seeds = [own.seed for own in configs]
         self._keys = [jax.random.PRNGKey(seed) for seed in self._seeds]
         self._on_metrics = on_metrics or (lambda row: None)
@@ -96,14 +96,14 @@ class Trainer:
         profile = CallProfile(self._folders[0].profile, self._config.profile_calls if is_main else 0)
         state = self._ready_to_call(restored, call)
         speed = Speed(call)
-        for recorder, facts in zip(self._recorders, metadata, strict=True):
-            recorder.begin(self._env_steps(call), call < self._num_calls, facts)
+        for recorder, saved in zip(self._recorders, metadata, strict=True):
+            recorder.begin(self._env_steps(call), call < self._num_calls, saved)
         saved_call, is_finite = call if restored is not None else None, True
         with Interrupt() as interrupt, profile:
             signal_name = self._stop_signal(interrupt)
             while call < self._num_calls and is_finite and not signal_name:
                 profile.next_call()
-                state, metrics = self._program.step(state)
+                state, metrics = self._program.run_call(state)
                 call += 1
                 rows = self._rows(call, metrics, speed)
                 self._log(rows)

@@ -49,9 +49,9 @@ def test_a_program_answers_for_each_of_its_runs(kind, num_runs):
     assert_equal(program(kind).merge(parts), state)
     assert_equal(program(kind).split(algorithm().policy_params(state))[-1], algorithm().policy_params(parts[-1]))
     parts = jax.tree.map(jnp.array, parts)  # the step consumes the state
-    after, metrics = program(kind).step(state)
+    after, metrics = program(kind).run_call(state)
     for part, new, own in zip(parts, program(kind).split(after), metrics, strict=True):
-        alone, (alone_metrics,) = program(SingleProgram).step(part)
+        alone, (alone_metrics,) = program(SingleProgram).run_call(part)
         assert_close(jax.device_get(new), jax.device_get(alone))
         assert own["loss"].value.shape == (ITERATIONS,)
         assert_close(own, alone_metrics)
