@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
 from mjx_walk.envs.models import warn_of_changed_sources
+from mjx_walk.envs.randomization.options import Randomization
 from mjx_walk.evaluation.gymnasium_worker import send
 from mjx_walk.evaluation.perturbations import Perturbation
 from mjx_walk.logs.progress import ScoringProgress
@@ -46,7 +47,8 @@ Episodes = Callable[[jax.Array, int], tuple[jax.Array, jax.Array, dict[str, jax.
 def score_in_gymnasium(task: Task, act: Act, num_episodes: int, seed: int = 0) -> Scores:
     """Score complete episodes in `gymnasium.make`: MuJoCo on the CPU, in float64, with the model's own solver.
 
-    One process per core plays the episodes. A task without an equivalent in Gymnasium is scored in its own engine.
+    One process per core plays the episodes. A task without an equivalent in Gymnasium is scored in its own engine,
+    with its original physics.
 
     Args:
         task: the environment and its keywords.
@@ -58,6 +60,8 @@ def score_in_gymnasium(task: Task, act: Act, num_episodes: int, seed: int = 0) -
         UserError: the model file is gone.
     """
     if not task.is_in_gymnasium:
+        if task.randomizer.is_on:
+            task = type(task)(dataclasses.replace(task.options, randomize=Randomization()), task.engine.name)
         return score_in_sim(task, compile_episodes(task, lambda obs, key: act(obs)), num_episodes, seed)
     seeds = [int(seed) + i for i in range(num_episodes)]  # Gymnasium refuses NumPy's integers
     returns, lengths = play_in_gymnasium(task, act, seeds)

@@ -13,6 +13,7 @@ from mjx_walk.algos import Algorithm, TrainState, make_algorithm, without_replay
 from mjx_walk.common.inline_evaluation import NO_RETURN
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.physics import resolve_engine
+from mjx_walk.envs.randomization.options import Randomization
 from mjx_walk.machine.compat import standard_settings
 from mjx_walk.settings.config import Config
 from mjx_walk.settings.input_files import check_model, warn_of_changed_inputs
@@ -60,7 +61,7 @@ class SavedPolicy:
         saved = read_saved_config(folder)
         self.reward_function = saved.env.reward_function
         """`PATH.py:FUNCTION` of the training, which is not loaded."""
-        self.config = _without_reward_function(saved)
+        self.config = _as_scored(saved)
         self._physics = physics
         check_model(folder, self.config.env)
         self._build()
@@ -236,6 +237,10 @@ def _engine_here(name: str) -> str:
         return "auto"
 
 
-def _without_reward_function(config: Config) -> Config:
-    """Drop the reward function: a downloaded folder must not run code. The policy and its scores do not need it."""
-    return dataclasses.replace(config, env=dataclasses.replace(config.env, reward_function=None))
+def _as_scored(config: Config) -> Config:
+    """Drop what a policy and its scores do not need: randomized physics, and the reward function.
+
+    A downloaded folder must not run code.
+    """
+    env = dataclasses.replace(config.env, reward_function=None, randomize=Randomization())
+    return dataclasses.replace(config, env=env)

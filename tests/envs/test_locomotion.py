@@ -18,7 +18,7 @@ from small_robot import small_robot, write
 import mjx_walk
 from mjx_walk.envs import make_env
 from mjx_walk.evaluation import engine_parity
-from mjx_walk.evaluation.gymnasium_scores import compile_episodes, score_in_sim
+from mjx_walk.evaluation.gymnasium_scores import compile_episodes, score_in_gymnasium, score_in_sim
 from mjx_walk.storage.scores import read_scores
 from mjx_walk.utils.errors import UserError
 
@@ -278,3 +278,13 @@ def test_engines_agree(path, physics):
     stepped = jax.jit(jax.vmap(task.step), compiler_options=OPTIMIZED)(states, actions)
     found = engine_parity.compare(task, engine_parity.one_step(reference, states, actions), jax.device_get(stepped))
     assert found.is_within, "\n".join(map(str, found.errors))
+
+
+def test_scores_use_the_original_physics(path):
+    options = {"xml_file": path, "max_episode_steps": 20}
+    plain = make_env("locomotion", physics="c", **options)
+    randomized = make_env("locomotion", physics="c", randomize={"mass": (0.5, 2.0), "num_models": 4}, **options)
+    scores = [
+        score_in_gymnasium(task, lambda obs: jnp.tile(stand(plain), (len(obs), 1)), 3) for task in (plain, randomized)
+    ]
+    np.testing.assert_array_equal(scores[0].returns, scores[1].returns)
