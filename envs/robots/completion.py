@@ -127,7 +127,8 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
             width=256,
             height=256,
         )
-    spec.worldbody.add_light(pos=[0, 0, 3], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    # A light from straight above draws black stripes of the plane's own shadow.
+    spec.worldbody.add_light(pos=[0, 0, 3], dir=[0.2, 0.1, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
 def _first_pose(model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
