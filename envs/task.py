@@ -16,6 +16,7 @@ from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.model_files import source_hashes
 from mjx_walk.envs.motors import motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
+from mjx_walk.envs.pickling import ReadFiles, build_again
 from mjx_walk.envs.randomization.episode import Randomizer
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping
@@ -99,7 +100,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle and copy a task as its arguments: engines hold threads and compiled functions."""
-        return type(self), (self.options, self.engine.name, bool(self.kept_arrays))
+        arguments = (self.options, self.engine.name, bool(self.kept_arrays))
+        return build_again, (type(self), arguments, self.read_files)
 
     def _check_shaping(self) -> None:
         has_x = self.HAS_X and models.is_coordinate(self.model, 0, axis=0)
@@ -111,6 +113,11 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     def reward_hashes(self) -> dict[str, str]:
         """SHA-256 of the reward function's files, by absolute path; empty without a reward function."""
         return self._custom_reward.hashes
+
+    @property
+    def read_files(self) -> ReadFiles:
+        """The files of the model and of the reward function, as they were read."""
+        return ReadFiles(self.model_file, self.model_sources, self.reward_hashes)
 
     @property
     def has_custom_reward(self) -> bool:
