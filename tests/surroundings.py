@@ -6,6 +6,7 @@ should, prints no traceback, and prints one line if it fails. Other users must b
 
 import dataclasses
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -160,7 +161,7 @@ def run(case: Case) -> tuple[int, str, str, float]:
     with tempfile.TemporaryDirectory(prefix="surroundings_") as folder:
         os.chmod(folder, 0o755)
         Path(folder, "reward.py").write_text(REWARD, encoding="utf-8")
-        command = f"{case.runner} bash -c 'trap : TERM; eval \"$COMMAND\" {case.redirect}'"
+        command = f"{case.runner} {shutil.which('bash')} -c 'trap : TERM; eval \"$COMMAND\" {case.redirect}'"
         paths = os.pathsep.join([str(CLONE), *filter(None, [os.environ.get("PYTHONPATH")])])
         env = os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu", "COMMAND": case.command}
         env["XLA_FLAGS"] = quick_compile(0)
