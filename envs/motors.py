@@ -75,11 +75,12 @@ def _joints_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
 
 def _joints_between(model: mujoco.MjModel, bodies: list[int]) -> set[int]:
     """Joints that move some of the bodies relative to the others. Body 0 is the world."""
-    chains = []
+    chains: list[set[int]] = []
     for body in bodies:
         chain: set[int] = set()
         while body:
             chain |= set(range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]))
             body = model.body_parentid[body]
         chains.append(chain)
-    return set().union(*chains).difference(set.intersection(*chains) if chains else set())
+    shared = chains[0].intersection(*chains) if chains else set()
+    return set().union(*chains).difference(shared)
