@@ -2,12 +2,12 @@
 
 import logging
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 from mjx_walk.envs.models import warn_of_changed_sources
 from mjx_walk.envs.user_files import changed_file
 
-__all__ = ["ReadFiles", "build_again", "warn_of_changed_files"]
+__all__ = ["ReadFiles", "build_again", "files_of", "warn_of_changed_files"]
 
 _LOGGER = logging.getLogger(__name__)
 _Task = TypeVar("_Task")
@@ -23,13 +23,28 @@ class ReadFiles(NamedTuple):
     """SHA-256 of the reward function's files, by absolute path."""
 
 
-def build_again(make: Callable[..., _Task], arguments: tuple[object, ...], files: ReadFiles) -> _Task:
+class _Reader(Protocol):
+    """A task. `envs.task` imports this module."""
+
+    model_file: str
+    model_sources: dict[str, str]
+
+    @property
+    def reward_hashes(self) -> dict[str, str]: ...
+
+
+def files_of(task: _Reader) -> ReadFiles:
+    """The files of a task's model and reward function, as they were read."""
+    return ReadFiles(task.model_file, task.model_sources, task.reward_hashes)
+
+
+def build_again(make: Callable[..., _Task], files: ReadFiles, *arguments: object) -> _Task:
     """Build a task from its pickle, and warn if a file that it reads has changed.
 
     Args:
         make: the task's class.
-        arguments: its arguments.
         files: what the pickled task had read.
+        arguments: of the class.
     """
     task = make(*arguments)
     warn_of_changed_files(files)

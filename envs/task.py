@@ -16,7 +16,7 @@ from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.model_files import source_hashes
 from mjx_walk.envs.motors import motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
-from mjx_walk.envs.pickling import ReadFiles, build_again
+from mjx_walk.envs.pickling import build_again, files_of
 from mjx_walk.envs.randomization.episode import Randomizer
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping
@@ -100,8 +100,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle and copy a task as its arguments: engines hold threads and compiled functions."""
-        arguments = (self.options, self.engine.name, bool(self.kept_arrays))
-        return build_again, (type(self), arguments, self.read_files)
+        return build_again, (type(self), files_of(self), self.options, self.engine.name, bool(self.kept_arrays))
 
     def _check_shaping(self) -> None:
         has_x = self.HAS_X and models.is_coordinate(self.model, 0, axis=0)
@@ -113,11 +112,6 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     def reward_hashes(self) -> dict[str, str]:
         """SHA-256 of the reward function's files, by absolute path; empty without a reward function."""
         return self._custom_reward.hashes
-
-    @property
-    def read_files(self) -> ReadFiles:
-        """The files of the model and of the reward function, as they were read."""
-        return ReadFiles(self.model_file, self.model_sources, self.reward_hashes)
 
     @property
     def has_custom_reward(self) -> bool:
@@ -274,15 +268,14 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         # A float32 zero: weakly typed metrics would compile every program twice.
         zero = jnp.float32(0.0)
         terms = {name: jnp.where(valid, value, zero) for name, value in terms.items()}
-        steps = state.steps + 1
         return State(
             physics=physics,
             memory=carry,
             obs=obs,
             reward=jnp.where(valid, reward, zero),
             terminated=terminated | ~valid,
-            truncated=steps >= self.max_episode_steps,
-            steps=steps,
+            truncated=state.steps + 1 >= self.max_episode_steps,
+            steps=state.steps + 1,
             metrics=terms | {"nonfinite": jnp.float32(~valid), "overflow": jnp.float32(overflow)},
             draws=draws,
         )

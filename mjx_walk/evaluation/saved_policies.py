@@ -16,6 +16,7 @@ from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.envs.randomization.options import Randomization
 from mjx_walk.envs.pickling import ReadFiles, warn_of_changed_files
+from mjx_walk.envs.pickling import ReadFiles, files_of, warn_of_changed_files
 from mjx_walk.machine.compat import standard_settings
 from mjx_walk.settings.config import Config
 from mjx_walk.settings.input_files import check_model, warn_of_changed_inputs
@@ -80,7 +81,7 @@ class SavedPolicy:
     def __getstate__(self) -> dict[str, object]:
         """Pickle and copy the parameters, without compiled functions."""
         kept = {name: value for name, value in vars(self).items() if name not in ("task", "algorithm", "act")}
-        return kept | {"policy_params": jax.device_get(self.policy_params), "_read_files": self.task.read_files}
+        return kept | {"policy_params": jax.device_get(self.policy_params), "_read_files": files_of(self.task)}
 
     @standard_settings()
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ from gymnasium.envs.mujoco import MujocoEnv
 
 from mjx_walk.envs import State, TaskOptions
 from mjx_walk.envs.model_changes import ModelSnapshot
-from mjx_walk.envs.pickling import warn_of_changed_files
+from mjx_walk.envs.pickling import files_of, warn_of_changed_files
 from mjx_walk.interop.gymnasium_programs import Programs, is_forked, make_programs, refuse_fork
 from mjx_walk.interop.mujoco_attributes import make_gymnasium_env
 
@@ -44,7 +44,7 @@ class CompiledEnv:
     def __getstate__(self) -> dict[str, object]:
         refuse_fork()
         state = {name: jax.device_get(value) for name, value in vars(self).items() if name not in self._NOT_PICKLED}
-        return state | {"_read_files": self._programs.task.read_files}
+        return state | {"_read_files": files_of(self._programs.task)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         read_files = state.pop("_read_files")
