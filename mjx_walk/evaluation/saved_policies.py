@@ -14,9 +14,8 @@ from mjx_walk.algos import Algorithm, TrainState, make_algorithm, without_replay
 from mjx_walk.common.inline_evaluation import NO_RETURN
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.physics import resolve_engine
-from mjx_walk.envs.randomization.options import Randomization
-from mjx_walk.envs.pickling import ReadFiles, warn_of_changed_files
 from mjx_walk.envs.pickling import ReadFiles, files_of, warn_of_changed_files
+from mjx_walk.envs.randomization.options import Randomization
 from mjx_walk.machine.compat import standard_settings
 from mjx_walk.settings.config import Config
 from mjx_walk.settings.input_files import check_model, warn_of_changed_inputs
