@@ -56,24 +56,31 @@ def torques_per_force(model: mujoco.MjModel) -> Float[np.ndarray, " motors"]:
 
 def _joints_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
     wrapped = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
-    bodies = []
-    for kind, found in zip(model.wrap_type[wrapped], model.wrap_objid[wrapped], strict=True):
-        if kind == _WRAP.mjWRAP_JOINT:  # a fixed tendon, which has nothing but joints
-            return {int(joint) for joint in model.wrap_objid[wrapped]}
-        if kind == _WRAP.mjWRAP_SITE:
-            bodies.append(model.site_bodyid[found])
+    joints: set[int] = set()
+    branches: list[list[int]] = [[]]  # bodies that the tendon passes; each pulley begins another branch
+    for number, found, coefficient in zip(
+        model.wrap_type[wrapped], model.wrap_objid[wrapped], model.wrap_prm[wrapped], strict=True
+    ):
+        kind = _WRAP(number)  # a NumPy integer is in no tuple of constants
+        if kind == _WRAP.mjWRAP_JOINT and coefficient:
+            joints.add(int(found))
+        elif kind == _WRAP.mjWRAP_PULLEY:
+            branches.append([])
+        elif kind == _WRAP.mjWRAP_SITE:
+            branches[-1].append(model.site_bodyid[found])
         elif kind in (_WRAP.mjWRAP_SPHERE, _WRAP.mjWRAP_CYLINDER):
-            bodies.append(model.geom_bodyid[found])
-    return _joints_between(model, bodies)
+            branches[-1].append(model.geom_bodyid[found])
+    return joints.union(*(_joints_between(model, bodies) for bodies in branches))
 
 
 def _joints_between(model: mujoco.MjModel, bodies: list[int]) -> set[int]:
     """Joints that move some of the bodies relative to the others. Body 0 is the world."""
-    chains = []
+    chains: list[set[int]] = []
     for body in bodies:
         chain: set[int] = set()
         while body:
             chain |= set(range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]))
             body = model.body_parentid[body]
         chains.append(chain)
-    return set().union(*chains).difference(chains[0].intersection(*chains))
+    shared = chains[0].intersection(*chains) if chains else set()
+    return set().union(*chains).difference(shared)

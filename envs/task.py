@@ -16,6 +16,7 @@ from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.model_files import source_hashes
 from mjx_walk.envs.motors import motor_dofs
 from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
+from mjx_walk.envs.pickling import build_again, files_of
 from mjx_walk.envs.randomization.episode import Randomizer
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping
@@ -99,7 +100,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle and copy a task as its arguments: engines hold threads and compiled functions."""
-        return type(self), (self.options, self.engine.name, bool(self.kept_arrays))
+        return build_again, (type(self), files_of(self), self.options, self.engine.name, bool(self.kept_arrays))
 
     def _check_shaping(self) -> None:
         has_x = self.HAS_X and models.is_coordinate(self.model, 0, axis=0)
@@ -267,15 +268,14 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         # A float32 zero: weakly typed metrics would compile every program twice.
         zero = jnp.float32(0.0)
         terms = {name: jnp.where(valid, value, zero) for name, value in terms.items()}
-        steps = state.steps + 1
         return State(
             physics=physics,
             memory=carry,
             obs=obs,
             reward=jnp.where(valid, reward, zero),
             terminated=terminated | ~valid,
-            truncated=steps >= self.max_episode_steps,
-            steps=steps,
+            truncated=state.steps + 1 >= self.max_episode_steps,
+            steps=state.steps + 1,
             metrics=terms | {"nonfinite": jnp.float32(~valid), "overflow": jnp.float32(overflow)},
             draws=draws,
         )

@@ -49,6 +49,8 @@ class TaskOptions:
         for name, value in list(vars(self).items()):
             if isinstance(value, list):  # a configuration file gives a range as a list
                 setattr(self, name, tuple(value))
+            elif isinstance(value, os.PathLike):
+                setattr(self, name, os.fspath(value))
         for group in dataclasses.fields(self):
             values, kind = getattr(self, group.name), group.default_factory
             if isinstance(values, dict) and isinstance(kind, type) and dataclasses.is_dataclass(kind):

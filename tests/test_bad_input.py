@@ -67,6 +67,8 @@ CASES = [
     ),
     (["algo=a2c", "algo.min_log_std=3"], "algo.min_log_std=3.0 is above algo.max_log_std=2.0"),
     (["env.reward_function=mine.py:f"], "mine.py'; write PATH.py:FUNCTION"),
+    (["env.xml_file="], "env.xml_file= names no file; write its path, or env.xml_file=null"),
+    (["env.reward_function="], "env.reward_function= names no file; write its path, or env.reward_function=null"),
     (["env.reward_function=f"], "env.reward_function=f: no file 'f'; write PATH.py:FUNCTION"),
     (["env.shaping.faling=1"], "unknown key 'env.shaping.faling'; did you mean: env.shaping.falling"),
     (["algo=td3", "algo.policy_delay=3"], "must be a multiple of algo.policy_delay=3"),

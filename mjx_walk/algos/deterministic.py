@@ -142,7 +142,7 @@ class DeterministicAlgorithm(OffPolicyAlgorithm[DeterministicState, _Determinist
         (loss, value), grads = jax.value_and_grad(self.critic_loss, has_aux=True)(learner.critic, target, batch)
         rate = self.config.critic_learning_rate * batch.rate_factor
         critic, critic_optimizer = self.apply_gradients(learner.critic, grads, learner.critic_optimizer, rate)
-        metrics = {"critic_loss": loss, "critic_value": value, "critic_grad_norm": optax.global_norm(grads)}
+        metrics = {"critic_loss": loss, "critic_value": value, "critic_grad_norm": optax.tree.norm(grads)}
         return learner.replace(critic=critic, critic_optimizer=critic_optimizer), metrics
 
     def full_update(

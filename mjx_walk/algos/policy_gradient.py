@@ -118,7 +118,7 @@ class PolicyGradientAlgorithm(OnPolicyAlgorithm[_PolicyGradientConfigT]):
             (total, metrics), grads = jax.value_and_grad(self.loss, has_aux=True)(
                 params, state.normalizer, part, entropy_coef, key
             )
-            metrics |= {"loss": total, "grad_norm": optax.global_norm(grads)}
+            metrics |= {"loss": total, "grad_norm": optax.tree.norm(grads)}
             return self.apply_gradients(params, grads, opt_state, rates), metrics
 
         samples = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), samples)

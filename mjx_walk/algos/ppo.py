@@ -84,7 +84,7 @@ class PPO(OnPolicyAlgorithm[PPOConfig]):
             key, loss_key = jax.random.split(key)
             data = jax.tree.map(lambda x: x[rows], batch.transitions)
             grads, metrics = jax.grad(loss_fn, has_aux=True)(params, normalizer, data, loss_key)
-            metrics["grad_norm"] = optax.global_norm(grads)
+            metrics["grad_norm"] = optax.tree.norm(grads)
             return (*self.apply_gradients(params, grads, opt_state, rates), key), metrics
 
         def epoch(carry, _):

@@ -126,7 +126,7 @@ class SAC(OffPolicyAlgorithm[SACState, SACConfig]):
             critic_optimizer=critic_optimizer,
             target_critic=polyak_update(learner.target_critic, critic, self.config.tau),
         )
-        return new_learner, metrics | {"critic_loss": loss, "critic_grad_norm": optax.global_norm(grads)}
+        return new_learner, metrics | {"critic_loss": loss, "critic_grad_norm": optax.tree.norm(grads)}
 
     def full_update(self, learner: SACState, batch: Batch, key: PRNGKeyArray) -> tuple[SACState, Losses]:
         config, losses = self.config, self.losses(batch)

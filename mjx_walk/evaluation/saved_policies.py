@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import logging
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from mjx_walk.algos import Algorithm, TrainState, make_algorithm, without_replay
 from mjx_walk.common.inline_evaluation import NO_RETURN
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.envs.physics import resolve_engine
+from mjx_walk.envs.pickling import ReadFiles, files_of, warn_of_changed_files
 from mjx_walk.envs.randomization.options import Randomization
 from mjx_walk.machine.compat import standard_settings
 from mjx_walk.settings.config import Config
@@ -78,12 +80,14 @@ class SavedPolicy:
     def __getstate__(self) -> dict[str, object]:
         """Pickle and copy the parameters, without compiled functions."""
         kept = {name: value for name, value in vars(self).items() if name not in ("task", "algorithm", "act")}
-        return kept | {"policy_params": jax.device_get(self.policy_params)}
+        return kept | {"policy_params": jax.device_get(self.policy_params), "_read_files": files_of(self.task)}
 
     @standard_settings()
-    def __setstate__(self, state: dict[str, object]) -> None:
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        read_files: ReadFiles = state.pop("_read_files")
         vars(self).update(state)
         self._build()
+        warn_of_changed_files(read_files)
 
     @functools.cached_property
     def act(self) -> Act:

@@ -8,8 +8,8 @@ from gymnasium.envs.mujoco import MujocoEnv
 
 from mjx_walk.envs import State, TaskOptions
 from mjx_walk.envs.model_changes import ModelSnapshot
-from mjx_walk.envs.models import warn_of_changed_sources
-from mjx_walk.interop.gymnasium_programs import Programs, is_forked, make_programs
+from mjx_walk.envs.pickling import files_of, warn_of_changed_files
+from mjx_walk.interop.gymnasium_programs import Programs, is_forked, make_programs, refuse_fork
 from mjx_walk.interop.mujoco_attributes import make_gymnasium_env
 
 __all__ = ["CompiledEnv"]
@@ -42,11 +42,12 @@ class CompiledEnv:
         return env.observation_space, env.action_space
 
     def __getstate__(self) -> dict[str, object]:
+        refuse_fork()
         state = {name: jax.device_get(value) for name, value in vars(self).items() if name not in self._NOT_PICKLED}
-        return state | {"_sources": self._programs.task.model_sources}
+        return state | {"_read_files": files_of(self._programs.task)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        sources = state.pop("_sources")
+        read_files = state.pop("_read_files")
         vars(self).update(state)
         self._build()
-        warn_of_changed_sources(self._programs.task.model_file, sources)
+        warn_of_changed_files(read_files)

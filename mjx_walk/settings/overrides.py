@@ -121,6 +121,8 @@ def _check(override: Override) -> None:
         raise UserError(f"{text}: glob is not supported; list the values with commas, and add -m to train with each")
     if key in ("hardware", "recipe") and not override.is_sweep_override() and not isinstance(override.value(), str):
         raise UserError(f"{text}: give one name, or leave {key}= out")
+    if key in ("env.xml_file", "env.reward_function") and override.value() == "":  # perhaps from an unset variable
+        raise UserError(f"{key}= names no file; write its path, or {key}=null for Gymnasium's own")
     names: dict[str, Collection[str]] = {"env": TASKS, "algo": ALGORITHMS}
     for value in named_values(override) if key in names else ():
         if value not in names[key]:

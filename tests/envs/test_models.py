@@ -250,7 +250,7 @@ def test_an_unstable_simulation_writes_nothing_into_the_working_directory(tmp_pa
     assert data.warning.number.any() and (tmp_path / "precious").read_text() == "mine"
 
 
-@pytest.mark.parametrize("given", ["hopper.xml", "here/mine.xml", "./here/mine.xml", ""])
+@pytest.mark.parametrize("given", ["hopper.xml", "here/mine.xml", "./here/mine.xml", Path("here/mine.xml"), ""])
 def test_gymnasium_gets_the_same_file(given, tmp_path, monkeypatch):
     """Gymnasium itself looks for a relative path among its assets."""
     assets = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"

@@ -19,9 +19,10 @@ BODIES = """
       <freejoint name="root"/>
       <geom size="0.1"/>
       <site name="torso"/>
+      <site name="front" pos="2 0 0"/>
       <body pos="1 0 0">
         <joint name="ball" type="ball"/>
-        <geom size="0.1"/>
+        <geom name="knuckle" size="0.1" pos="0 0.03 0"/>
         <site name="arm" pos="0.1 0.2 0.3"/>
         <body pos="1 0 0">
           <joint name="hinge" axis="0 1 0"/>
@@ -41,6 +42,11 @@ BODIES = """
   <tendon>
     <fixed name="fixed"><joint joint="hinge" coef="1"/><joint joint="slide" coef="-2"/></fixed>
     <spatial name="spatial"><site site="hand"/><site site="arm"/><geom geom="ankle"/><site site="foot"/></spatial>
+    <spatial name="around"><site site="torso"/><geom geom="knuckle"/><site site="front"/></spatial>
+    <spatial name="pulley">
+      <site site="hand"/><site site="arm"/><pulley divisor="2"/><site site="torso"/><site site="foot"/>
+    </spatial>
+    <fixed name="zero"><joint joint="hinge" coef="1"/><joint joint="slide" coef="0"/></fixed>
   </tendon>
   <actuator>{}</actuator>
 </mujoco>
@@ -55,6 +61,9 @@ MOVED = {
     '<motor jointinparent="root" gear="0 0 0 1 0 0"/>': {"root"},
     '<motor tendon="fixed" gear="2"/>': {"hinge", "slide"},
     '<motor tendon="spatial"/>': {"ball", "hinge", "slide", "twist"},
+    '<motor tendon="around"/>': {"ball"},
+    '<motor tendon="pulley"/>': {"hinge", "slide", "twist"},
+    '<motor tendon="zero"/>': {"hinge"},
     '<motor site="torso" gear="1 1 1 0 0 0"/>': {"root"},
     '<motor site="hand" gear="1 1 1 1 1 1"/>': {"root", "ball", "hinge"},
     '<motor site="hand" refsite="foot" gear="1 1 1 1 1 1"/>': {"ball", "hinge", "slide", "twist"},

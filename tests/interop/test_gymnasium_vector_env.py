@@ -4,6 +4,7 @@ import copy
 import pickle
 
 import gymnasium
+import jax
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
@@ -103,6 +104,13 @@ def test_wrong_actions_and_keywords_raise():
     for mode, says in (("human", "'human' shows one environment"), ("rgb_array_list", "collects the frames of one")):
         with pytest.raises(UserError, match=says):
             gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=2, render_mode=mode)
+
+
+@pytest.mark.parametrize("prng", ["rbg", "unsafe_rbg"])
+def test_other_random_generators_of_jax_are_refused(prng):
+    refused = rf"^JAX_DEFAULT_PRNG_IMPL={prng}: make_vec needs threefry2x32; unset it$"
+    with jax.default_prng_impl(prng), pytest.raises(UserError, match=refused):
+        gymnasium.make_vec("mjx_walk/Walker2d-v5", num_envs=2, physics="c")
 
 
 def test_copies_and_attributes():
