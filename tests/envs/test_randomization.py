@@ -149,7 +149,7 @@ def test_a_preset_is_a_start_for_other_settings():
 @pytest.mark.parametrize(
     ("randomize", "says"),
     [
-        ("defualt", "unknown env.randomize 'defualt'; did you mean: default"),
+        ("defaults", "unknown env.randomize 'defaults'; did you mean: default"),
         ({"mass": (2.0, 1.0)}, r"env\.randomize\.mass=\[2\.0, 1\.0\]: give the lower value first"),
         ({"push": 1.0}, r"env\.randomize\.push=1\.0: the robot cannot move horizontally; set it to 0"),
         ({"frictoin": (1.0, 2.0)}, r"unknown key 'env\.randomize\.frictoin'"),
