@@ -29,7 +29,7 @@ _Shape = jax.ShapeDtypeStruct
 
 
 class _Workspace(NamedTuple):
-    """What one thread steps with."""
+    """Model and data of one thread."""
 
     model: mujoco.MjModel
     data: mujoco.MjData

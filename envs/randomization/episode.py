@@ -1,4 +1,4 @@
-"""What an episode draws: its model, the latency of its actions, noise and pushes."""
+"""Draws of an episode: its model, the latency of its actions, noise and pushes."""
 
 import math
 
