@@ -96,7 +96,7 @@ def reference_cases(model: mujoco.MjModel, num_cases: int = 6, every: int = 12) 
 
 
 def _set(data: mujoco.MjData, state: PhysicsState) -> None:
-    data.qpos[:], data.qvel[:], data.qacc_warmstart[:], act = state
+    data.qpos[:], data.qvel[:], data.qacc_warmstart[:], act = state[:4]
     if act is not None:
         data.act[:] = act
 

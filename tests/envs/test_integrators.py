@@ -41,7 +41,7 @@ def state_of(data):
 
 
 def load(data, state):
-    data.qpos[:], data.qvel[:], data.qacc_warmstart[:], act = state
+    data.qpos[:], data.qvel[:], data.qacc_warmstart[:], act = state[:4]
     if act is not None:
         data.act[:] = act
 
