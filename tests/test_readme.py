@@ -163,7 +163,8 @@ def sizes(arguments):
     if any(re.match(r"algo=.*,", argument) for argument in arguments):
         return []
     of_the_command = ("-", "hydra.", "seeds=", "devices=")
-    first_job = [re.sub(r",.*", "", argument) for argument in arguments if not argument.startswith(of_the_command)]
+    # The first value of a sweep. A comma in brackets belongs to a list.
+    first_job = [re.sub(r"^([^\[]*?),.*", r"\1", one) for one in arguments if not one.startswith(of_the_command)]
     config = load_config([*first_job, "run_dir=null"])
     have = {f"algo.{field.name}" for field in dataclasses.fields(config.algo)} | {"num_envs", "evaluation.num_envs"}
     given = {argument.split("=")[0] for argument in arguments}
