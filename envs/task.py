@@ -268,14 +268,15 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         # A float32 zero: weakly typed metrics would compile every program twice.
         zero = jnp.float32(0.0)
         terms = {name: jnp.where(valid, value, zero) for name, value in terms.items()}
+        steps = state.steps + 1
         return State(
             physics=physics,
             memory=carry,
             obs=obs,
             reward=jnp.where(valid, reward, zero),
             terminated=terminated | ~valid,
-            truncated=state.steps + 1 >= self.max_episode_steps,
-            steps=state.steps + 1,
+            truncated=steps >= self.max_episode_steps,
+            steps=steps,
             metrics=terms | {"nonfinite": jnp.float32(~valid), "overflow": jnp.float32(overflow)},
             draws=draws,
         )

@@ -85,8 +85,7 @@ def make_engine(
     Raises:
         UserError: the engine does not simulate something that the model has, or does not return a derived array.
     """
-    refuse_unsupported(model, name)
-    refuse_unsupported(_most_slippery(model, models), name)
+    refuse_unsupported(_most_slippery(model, models) if models else model, name)
     refuse_derived(model, name, derived)
     if name == "c":
         from mjx_walk.envs.physics.mujoco_c import CEngine

@@ -12,8 +12,8 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from mjx_walk.envs.models import is_coordinate
 from mjx_walk.envs.physics import PhysicsState
-from mjx_walk.envs.randomization.model_pool import changed_models, changes_models
-from mjx_walk.envs.randomization.options import Randomization, changes
+from mjx_walk.envs.randomization.model_pool import changed_models
+from mjx_walk.envs.randomization.options import Randomization, changes, changes_models
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["Draws", "Randomizer"]
@@ -58,8 +58,9 @@ class Randomizer:
         for name, value in changes(options).items():
             if isinstance(value, tuple) and value[0] > value[1]:
                 raise UserError(f"env.randomize.{name}={list(value)}: give the lower value first")
-        self.is_on = bool(changes(options))
         self.models = changed_models(model, options) if changes_models(options) else {}
+        self._has_draws = bool(options.latency[1] or options.action_noise or options.observation_noise or options.push)
+        self.is_on = bool(self.models) or self._has_draws
         self._options = options
         self._num_substeps = num_substeps
         self._center, self._half_range = np.mean(action_range, axis=0), np.ptp(action_range, axis=0) / 2
@@ -77,8 +78,11 @@ class Randomizer:
         return jax.random.randint(jax.random.fold_in(key, _MODEL), (), 0, self._options.num_models)
 
     def draw_episode(self, key: PRNGKeyArray) -> Draws | None:
-        """Draw an episode's latency and the time of its first push. Before the first action, motors get the center."""
-        if not self.is_on:
+        """Draw an episode's latency and the time of its first push; None if actions, observations and velocities stay.
+
+        Before the first action reaches them, motors get the center of the action's range.
+        """
+        if not self._has_draws:
             return None
         key, latency_key, push_key = jax.random.split(jax.random.fold_in(key, _EPISODE), 3)
         shortest, longest = self._latency
@@ -137,6 +141,7 @@ class Randomizer:
         speed_key, angle_key = jax.random.split(key)
         speed = jnp.where(is_due, jax.random.uniform(speed_key, maxval=self._options.push), 0.0)
         angle = jax.random.uniform(angle_key, maxval=2 * jnp.pi)
-        direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)])[jnp.array(self._pushed_axes)]
-        direction = direction if len(self._pushed_axes) == 2 else jnp.sign(direction)
-        return physics._replace(qvel=physics.qvel.at[jnp.array(self._pushed_axes)].add(speed * direction))
+        axes = jnp.array(self._pushed_axes)
+        direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)])[axes]
+        direction = direction if len(axes) == 2 else jnp.sign(direction)
+        return physics._replace(qvel=physics.qvel.at[axes].add(speed * direction))

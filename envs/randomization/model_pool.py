@@ -15,22 +15,15 @@ from mjx_walk.envs.randomization.edits import (
 )
 from mjx_walk.envs.randomization.options import Randomization
 
-__all__ = ["ModelPool", "change_model", "changed_models", "changes_models"]
+__all__ = ["ModelPool", "change_model", "changed_models"]
 
 _LOGGER = logging.getLogger(__name__)
 
 ModelPool = dict[str, np.ndarray]
 """Values of `MjModel` by name, `[num_models, …]` each: all that differ from the original in any of the models."""
 
-_MODEL_OPTIONS = ("friction", "mass", "center_of_mass", "torque", "damping")
 _NUM_PROBES = 16
 """Models that are compared with the original in all values. A value that depends on a draw differs in the first."""
-
-
-def changes_models(options: Randomization) -> bool:
-    """Whether the options change the model itself."""
-    defaults = vars(Randomization())
-    return any(vars(options)[name] != defaults[name] for name in _MODEL_OPTIONS)
 
 
 def change_model(model: mujoco.MjModel, options: Randomization, random: np.random.Generator) -> None:

@@ -4,9 +4,15 @@ import dataclasses
 
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.near_misses import unknown
-from mjx_walk.utils.setting_fields import setting
+from mjx_walk.utils.setting_fields import AnyBut, setting
 
-__all__ = ["PRESETS", "Randomization", "changes", "preset"]
+__all__ = ["PRESETS", "Randomization", "changes", "changes_models", "preset"]
+
+_CHANGES_MODELS = {
+    **dict.fromkeys(("friction", "mass", "torque", "damping"), AnyBut((1.0, 1.0))),
+    "center_of_mass": AnyBut(0.0),
+}
+"""Options that change the model itself, unless they have this value."""
 
 
 @dataclasses.dataclass
@@ -31,9 +37,9 @@ class Randomization:
     """Standard deviation of the noise on each observation, in the observation's unit."""
     push: float = setting(0.0, at_least=0)
     """Largest change of the horizontal velocity by a push, m/s. It moves the entire robot in a random direction."""
-    push_seconds: tuple[float, float] = setting((3.0, 8.0), above=0)
+    push_seconds: tuple[float, float] = setting((3.0, 8.0), above=0, only_if={"push": AnyBut(0.0)})
     """Range of the time from one push to the next, s."""
-    num_models: int = setting(1024, at_least=1, at_most=2**16)
+    num_models: int = setting(1024, at_least=1, at_most=2**16, only_if=_CHANGES_MODELS)
     """Changed models. An episode draws one of them. They are the same in every run with the same ranges."""
 
     def __post_init__(self):
@@ -74,3 +80,8 @@ def changes(options: Randomization) -> dict[str, object]:
     """The options that differ from their defaults."""
     defaults = vars(Randomization())
     return {name: value for name, value in vars(options).items() if value != defaults[name]}
+
+
+def changes_models(options: Randomization) -> bool:
+    """Whether the options change the model itself."""
+    return not _CHANGES_MODELS.keys().isdisjoint(changes(options))

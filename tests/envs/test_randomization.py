@@ -165,6 +165,17 @@ def test_friction_that_an_engine_does_not_simulate_is_refused():
         make_env("walker2d", "jax", randomize={"friction": (0.01, 1.0), "num_models": 64})
 
 
+@pytest.mark.parametrize("setting", ["push_seconds=[1,2]", "num_models=5"])
+def test_a_setting_without_effect_is_refused(setting):
+    with pytest.raises(UserError, match=r"env\.randomize\..* has no effect with env\.randomize\."):
+        load_config(["env=walker2d", f"env.randomize.{setting}"])
+
+
+def test_changed_models_alone_draw_nothing_in_a_step():
+    state = make_env("walker2d", "c", randomize=MODELS).reset(jax.random.PRNGKey(0))
+    assert state.draws is None and state.physics.model_index is not None
+
+
 @pytest.mark.slow
 def test_resume_is_exact(tmp_path):
     """Draws, late actions and the times of pushes are in the checkpoint."""
