@@ -78,7 +78,7 @@ class Randomizer:
         return jax.random.randint(jax.random.fold_in(key, _MODEL), (), 0, self._options.num_models)
 
     def draw_episode(self, key: PRNGKeyArray) -> Draws | None:
-        """Draw an episode's latency and the time of its first push; None if actions, observations and velocities stay.
+        """Draw an episode's latency and the time of its first push; None if nothing but a model is drawn.
 
         Before the first action reaches them, motors get the center of the action's range.
         """
