@@ -275,3 +275,12 @@ def _motors_limited_twice(model: mujoco.MjModel) -> Mask:
     num_motors = np.bincount(tendon[on_tendon], minlength=max(model.ntendon, 1))
     is_limited = model.tendon_actfrclimited.astype(bool) if model.ntendon else np.zeros(1, bool)
     return on_tendon & model.actuator_forcelimited.astype(bool) & is_limited[tendon] & (num_motors[tendon] > 1)
+
+
+@FEATURES.entry(("warp",), "pair", "two contact pairs of the same geoms", "remove one of them")
+def _repeated_pairs(model: mujoco.MjModel) -> Mask:
+    """Pairs whose geoms an earlier one has. MuJoCo makes the contacts of both."""
+    geoms = np.sort(np.stack([model.pair_geom1, model.pair_geom2]), axis=0)
+    is_repeated = np.ones(model.npair, bool)
+    is_repeated[np.unique(geoms, axis=1, return_index=True)[1]] = False
+    return is_repeated

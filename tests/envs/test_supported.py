@@ -245,6 +245,14 @@ REFUSED = {
         {"contact": '<pair name="sticky" geom1="floor" geom2="torso" adhesion="5"/>'},
         "adhesion (contact pair 'sticky')",
     ),
+    "repeated_pair": (
+        WARP,
+        {
+            "contact": '<pair geom1="floor" geom2="torso"/><pair geom1="shin" geom2="floor"/>'
+            '<pair name="again" geom1="torso" geom2="floor" condim="1"/>'
+        },
+        "two contact pairs of the same geoms (contact pair 'again'); remove one of them",
+    ),
     "surfacevel": (JAX, {"floor": 'surfacevel="1 0 0 0 0 0"'}, "moving surfaces (geom 'floor')"),
     "ellipsoid_fluid": (
         JAX,
