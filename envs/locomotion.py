@@ -23,9 +23,9 @@ from mjx_walk.envs.physics import Derived, PhysicsState
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import Terms
 from mjx_walk.envs.robots.metadata import servo_metadata
-from mjx_walk.envs.robots.robot import load_robot
+from mjx_walk.envs.robots.robot import load_robot, with_ground
 from mjx_walk.envs.robots.servos import Motors
-from mjx_walk.envs.robots.surfaces import Surface, heights
+from mjx_walk.envs.robots.surfaces import Surface, heights, places
 from mjx_walk.envs.state import Carry, State
 from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import MAX_FRAME_SKIP, TaskOptions
@@ -109,6 +109,8 @@ class Locomotion(Task):
 
     def load_model(self) -> mujoco.MjModel:
         self.robot = load_robot(self.model_file, self.options.motors, self.options.feet)
+        if self.ground.is_on:
+            self.robot = with_ground(self.robot, self.ground.added_to(self.robot.spec))
         self._targets = jnp.asarray(self.robot.targets, jnp.float32)
         self._touch_height = _CONTACT * (self.robot.standing[2] - self.robot.floor)
         return self.robot.model
@@ -211,8 +213,10 @@ class Locomotion(Task):
         }
 
     def _height(self, part: Surface, derived: Derived) -> Float[Array, ""]:
-        """Height of the lowest point of a part above the floor, m. Infinite for a part without a surface."""
+        """Height of the lowest point of a part above the ground, m. Infinite for a part without a surface."""
         found = heights(part, derived["geom_xpos"], derived["geom_xmat"])
+        if self.ground.is_on:
+            found -= self.ground.height(*places(part, derived["geom_xpos"], derived["geom_xmat"]))
         return found.min(initial=jnp.inf) - self.robot.floor
 
     def _touches_floor(self, derived: Derived) -> Bool[Array, " feet"]:

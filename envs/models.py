@@ -24,6 +24,7 @@ __all__ = [
     "check_pose",
     "is_coordinate",
     "load_model",
+    "load_spec",
     "model_file",
     "warn_of_changed_sources",
     "warn_of_coordinates",
@@ -91,13 +92,18 @@ def load_model(xml_file: str) -> mujoco.MjModel:
     return model
 
 
+def load_spec(xml_file: str) -> mujoco.MjSpec:
+    """Load a model that `load_model` accepts, to change it."""
+    with hide_deprecations():
+        return mujoco.MjSpec.from_file(os.path.abspath(model_path(xml_file)))
+
+
 def _has_enough_memory(path: Path, model: mujoco.MjModel) -> bool:
     """Whether a model has the memory that MuJoCo chooses by default, or enough while every contact and limit acts.
 
     With less, MuJoCo leaves out constraints, or stops with an error in the middle of an episode.
     """
-    with hide_deprecations():
-        spec = mujoco.MjSpec.from_file(str(path))
+    spec = load_spec(str(path))
     if all(size < 0 for size in (spec.memory, spec.nstack, spec.njmax, spec.nconmax)):  # MuJoCo chooses
         return True
     spec.memory = spec.nstack = spec.njmax = spec.nconmax = -1

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs import models
 from mjx_walk.envs.custom_reward import CustomReward
+from mjx_walk.envs.ground.terrain import Terrain
 from mjx_walk.envs.info import GymnasiumInfo
 from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.model_files import source_hashes
@@ -72,6 +73,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         self.options = options = with_absolute_paths(options, working_folder())
         self.max_episode_steps = options.max_episode_steps
         self.model_file = models.model_file(options.xml_file or self.XML_FILES[options.version], options.name)
+        self.ground = Terrain(options.ground, options.name, self.HAS_X, self.HAS_Y, self.HEIGHT_INDEX)
         self.model = self.load_model()
         self.model_sources = source_hashes(self.model_file)
         self.body_ids = {body: models.body_id(self.model, body) for body in self.named_bodies()}
@@ -134,8 +136,9 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         return {}
 
     def load_model(self) -> mujoco.MjModel:
-        """The model of `model_file`. A task may complete it."""
-        return models.load_model(self.model_file)
+        """The model of `model_file` on `ground`. A task may complete it."""
+        model = models.load_model(self.model_file)
+        return self.ground.added_to(models.load_spec(self.model_file)) if self.ground.is_on else model
 
     def num_substeps(self) -> int:
         """Physics steps of one environment step."""
@@ -199,7 +202,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
     @standard_dtypes()
     def reset(self, key: PRNGKeyArray) -> State:
         """Random initial state, drawn by `initial_state`."""
-        return self.reset_to(*self.initial_state(key), key=jax.random.fold_in(key, 1))
+        start = self.ground.start(jax.random.fold_in(key, 2), self.initial_state(key))
+        return self.reset_to(*start, key=jax.random.fold_in(key, 1))
 
     @standard_dtypes()
     def reset_to(
@@ -227,8 +231,9 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         draws = self.randomizer.draw_episode(key)
         physics = physics_state(self.model, qpos, qvel, warmstart, act, self.randomizer.draw_model(key))
         derived = self.engine.forward(physics)
-        carry = self.initial_carry(key, physics, derived)
-        obs = self.randomizer.observe(draws, self.observe_all(physics, derived, carry))
+        seen = self.ground.relative(physics)
+        carry = self.initial_carry(key, seen, derived)
+        obs = self.randomizer.observe(draws, self.observe_all(seen, derived, carry))
         return first_state(physics, carry | self._kept(derived), obs, self.metric_names, draws)
 
     @standard_dtypes()
@@ -252,9 +257,10 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         action = jnp.asarray(action, jnp.float32)
         draws, start, control = self.randomizer.disturb(state.draws, state.physics, action)
         physics, derived, overflow = self.engine.step(start, control)
-        carry = self.next_carry(state, physics, derived, action) | self._kept(derived)
-        obs = self.randomizer.observe(draws, self.observe_all(physics, derived, carry))
-        terms, reward, terminated = self.reward_and_termination(state, physics, derived, carry, action)
+        seen = self.ground.relative(physics)
+        carry = self.next_carry(state, seen, derived, action) | self._kept(derived)
+        obs = self.randomizer.observe(draws, self.observe_all(seen, derived, carry))
+        terms, reward, terminated = self.reward_and_termination(state, seen, derived, carry, action)
         terms, reward = self._custom_reward(
             RewardStep(terms, reward, state.physics, physics, obs, action, terminated, self.dt)
         )

@@ -5,18 +5,24 @@ import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from mjx_walk.envs.ground.options import PRESETS as GROUNDS
+from mjx_walk.envs.ground.options import Ground
 from mjx_walk.envs.model_files import absolute_xml_file, model_path
-from mjx_walk.envs.randomization.options import Randomization, preset
+from mjx_walk.envs.option_presets import changes, preset
+from mjx_walk.envs.randomization.options import PRESETS as RANDOMIZATIONS
+from mjx_walk.envs.randomization.options import Randomization
 from mjx_walk.envs.reward_shaping import Shaping
 from mjx_walk.envs.state import NO_TIME_LIMIT
 from mjx_walk.envs.user_files import absolute_source
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.setting_fields import setting
+from mjx_walk.utils.setting_fields import Dataclass, setting
 
-__all__ = ["MAX_FRAME_SKIP", "TaskOptions", "check_version", "with_absolute_paths"]
+__all__ = ["MAX_FRAME_SKIP", "OPTION_PRESETS", "TaskOptions", "check_version", "with_absolute_paths"]
 
 MAX_FRAME_SKIP = 10_000
 """With more, the physics of one environment step takes minutes and cannot be interrupted."""
+OPTION_PRESETS: dict[str, Mapping[str, Dataclass]] = {"randomize": RANDOMIZATIONS, "ground": GROUNDS}
+"""Presets of groups of env options, by the group."""
 
 
 @dataclasses.dataclass
@@ -37,6 +43,8 @@ class TaskOptions:
     """Weights of additional reward terms."""
     randomize: Randomization = dataclasses.field(default_factory=Randomization)
     """Randomized physics of training, or the name of a preset."""
+    ground: Ground = dataclasses.field(default_factory=Ground)
+    """Hills on the floor, or the name of a preset."""
     reward_function: str | None = None
     """`PATH.py:FUNCTION`, a custom reward that replaces Gymnasium's; see `mjx_walk.envs.reward_shaping`."""
     task: str | None = None
@@ -44,8 +52,9 @@ class TaskOptions:
 
     def __post_init__(self):
         self.xml_file = self.xml_file or None
-        if isinstance(self.randomize, str):
-            self.randomize = preset(self.randomize)
+        for name, presets in OPTION_PRESETS.items():
+            if isinstance(getattr(self, name), str):
+                setattr(self, name, preset(f"env.{name}", getattr(self, name), presets))
         for name, value in list(vars(self).items()):
             if isinstance(value, list):  # a configuration file gives a range as a list
                 setattr(self, name, tuple(value))
@@ -61,8 +70,7 @@ class TaskOptions:
 
     def changed(self) -> dict[str, object]:
         """Options that differ from their defaults."""
-        defaults = vars(type(self)())
-        return {name: value for name, value in vars(self).items() if value != defaults[name]}
+        return changes(self)
 
     def gymnasium_kwargs(self) -> dict[str, object]:
         """Keyword arguments of Gymnasium's class for the equivalent environment, without those at their default."""
@@ -72,7 +80,16 @@ class TaskOptions:
         return keywords
 
 
-_NOT_IN_GYMNASIUM = ("name", "version", "max_episode_steps", "shaping", "randomize", "reward_function", "task")
+_NOT_IN_GYMNASIUM = (
+    "name",
+    "version",
+    "max_episode_steps",
+    "shaping",
+    "randomize",
+    "ground",
+    "reward_function",
+    "task",
+)
 """Fields of `TaskOptions` that the constructors of Gymnasium's classes do not take."""
 
 

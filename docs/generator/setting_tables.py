@@ -8,9 +8,11 @@ from mjx_walk.algos import ALGORITHMS
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.envs import TASKS
-from mjx_walk.envs.randomization.options import PRESETS, Randomization, changes
+from mjx_walk.envs.ground.options import Ground
+from mjx_walk.envs.option_presets import changes
+from mjx_walk.envs.randomization.options import Randomization
 from mjx_walk.envs.reward_shaping import Shaping
-from mjx_walk.envs.task_options import TaskOptions
+from mjx_walk.envs.task_options import OPTION_PRESETS, TaskOptions
 from mjx_walk.settings.config import CheckpointConfig, Config
 from mjx_walk.utils import setting_fields
 
@@ -21,6 +23,7 @@ GROUPS = {
     "task": (TaskOptions, "env."),
     "shaping": (Shaping, "env.shaping."),
     "randomize": (Randomization, "env.randomize."),
+    "ground": (Ground, "env.ground."),
 }
 """Groups of settings that do not depend on the task or the algorithm, with the start of their full keys."""
 
@@ -54,11 +57,12 @@ def group_table(name: str) -> str:
 
 
 def presets() -> str:
-    """The settings of each preset of randomized physics."""
+    """The settings of each preset of env options."""
     rows = []
-    for name, options in PRESETS.items():
-        settings = {key: list(value) if isinstance(value, tuple) else value for key, value in changes(options).items()}
-        rows.append([code(f"env.randomize={name}"), ", ".join(code(f"{key}={settings[key]}") for key in settings)])
+    for group, presets in OPTION_PRESETS.items():
+        for name, options in presets.items():
+            given = {key: list(value) if isinstance(value, tuple) else value for key, value in changes(options).items()}
+            rows.append([code(f"env.{group}={name}"), ", ".join(code(f"{key}={given[key]}") for key in given)])
     return table(["Preset", "Settings"], rows)
 
 

@@ -11,9 +11,10 @@ from jax import Array
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from mjx_walk.envs.models import is_coordinate
+from mjx_walk.envs.option_presets import changes
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.envs.randomization.model_pool import changed_models
-from mjx_walk.envs.randomization.options import Randomization, changes, changes_models
+from mjx_walk.envs.randomization.options import Randomization, changes_models
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["Draws", "Randomizer"]

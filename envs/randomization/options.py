@@ -2,11 +2,10 @@
 
 import dataclasses
 
-from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.near_misses import unknown
+from mjx_walk.envs.option_presets import changes
 from mjx_walk.utils.setting_fields import AnyBut, setting
 
-__all__ = ["PRESETS", "Randomization", "changes", "changes_models", "preset"]
+__all__ = ["PRESETS", "Randomization", "changes_models"]
 
 _CHANGES_MODELS = {
     **dict.fromkeys(("friction", "mass", "torque", "damping"), AnyBut((1.0, 1.0))),
@@ -63,23 +62,6 @@ PRESETS = {
     ),
 }
 """Randomizations by name, for `env.randomize=NAME`."""
-
-
-def preset(name: str) -> Randomization:
-    """A copy of a preset.
-
-    Raises:
-        UserError: an unknown name.
-    """
-    if name not in PRESETS:
-        raise UserError(unknown("env.randomize", name, PRESETS))
-    return dataclasses.replace(PRESETS[name])
-
-
-def changes(options: Randomization) -> dict[str, object]:
-    """The options that differ from their defaults."""
-    defaults = vars(Randomization())
-    return {name: value for name, value in vars(options).items() if value != defaults[name]}
 
 
 def changes_models(options: Randomization) -> bool:

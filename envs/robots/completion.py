@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from mjx_walk.envs.models import load_model, model_path
+from mjx_walk.envs.models import load_model, load_spec
 from mjx_walk.envs.motors import joint_of
 from mjx_walk.envs.robots.servos import Gains, Motors, gains, torque_motors
 from mjx_walk.machine.quiet_mujoco import hide_deprecations
@@ -28,6 +28,8 @@ class Completed(NamedTuple):
     """A robot's model with a floor and servos."""
 
     model: mujoco.MjModel
+    spec: mujoco.MjSpec
+    """The same, for further changes."""
     floor: float
     """Height of the floor, m."""
 
@@ -46,8 +48,7 @@ def complete(xml_file: str, motors: Motors) -> Completed:
     """
     model = load_model(xml_file)
     _check_root(model, xml_file)
-    with hide_deprecations():
-        spec = mujoco.MjSpec.from_file(str(model_path(xml_file)))
+    spec = load_spec(xml_file)
     floors = _floors(model)
     if not floors.size:
         _add_floor(spec)
@@ -57,7 +58,7 @@ def complete(xml_file: str, motors: Motors) -> Completed:
         spec.memory = spec.nstack = spec.njmax = spec.nconmax = -1  # MuJoCo chooses
         with hide_deprecations():
             model = spec.compile()
-    return Completed(model, float(model.geom_pos[floors[0], 2]) if floors.size else 0.0)
+    return Completed(model, spec, float(model.geom_pos[floors[0], 2]) if floors.size else 0.0)
 
 
 def pose_within_ranges(model: mujoco.MjModel, qpos: Float[np.ndarray, " nq"]) -> Float[np.ndarray, " nq"]:

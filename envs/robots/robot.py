@@ -16,7 +16,7 @@ from mjx_walk.envs.robots.surfaces import Surface, surface, touching_geoms
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.near_misses import near_misses
 
-__all__ = ["Robot", "load_robot"]
+__all__ = ["Robot", "load_robot", "with_ground"]
 
 _LOGGER = logging.getLogger(__name__)
 _TOUCH = 0.02
@@ -28,6 +28,8 @@ class Robot:
     """A model whose first joint is the root's free joint, with a position servo for each joint that moves it."""
 
     model: mujoco.MjModel
+    spec: mujoco.MjSpec
+    """The model, for further changes."""
     root: int
     """The body with the free joint."""
     floor: float
@@ -58,13 +60,14 @@ def load_robot(xml_file: str, motors: Motors, feet: Sequence[str] = ()) -> Robot
         UserError: the file is missing or invalid, the model is no robot that can walk, it does not stand, or a foot is
             unknown.
     """
-    model, floor = complete(xml_file, motors)
+    model, spec, floor = complete(xml_file, motors)
     joints = np.array([joint_of(model, motor) for motor in range(model.nu)], int)
     standing = standing_pose(model, floor, joints)
     found = [_named_foot(model, name) for name in feet] or _feet(model, standing.qpos, floor)
     _LOGGER.info("Feet: %s", ", ".join(_name(model, geoms) for geoms in found))
     return Robot(
         model=model,
+        spec=spec,
         root=int(model.jnt_bodyid[0]),
         floor=floor,
         standing=standing.qpos,
@@ -74,6 +77,14 @@ def load_robot(xml_file: str, motors: Motors, feet: Sequence[str] = ()) -> Robot
         feet=tuple(surface(model, geoms) for geoms in found),
         torso=surface(model, torso_geoms(model)),
     )
+
+
+def with_ground(robot: Robot, model: mujoco.MjModel) -> Robot:
+    """The robot in its model with more geoms of the world, which come after the others there."""
+    first = int((robot.model.geom_bodyid == 0).sum())
+    added = model.ngeom - robot.model.ngeom
+    moved = [part._replace(geoms=part.geoms + added * (part.geoms >= first)) for part in (*robot.feet, robot.torso)]
+    return dataclasses.replace(robot, model=model, feet=tuple(moved[:-1]), torso=moved[-1])
 
 
 def _feet(model: mujoco.MjModel, qpos: Float[np.ndarray, " nq"], floor: float) -> list[Int[np.ndarray, " geoms"]]:

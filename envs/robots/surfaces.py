@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-__all__ = ["Surface", "heights", "surface", "touching_geoms"]
+__all__ = ["Surface", "heights", "places", "surface", "touching_geoms"]
 
 _GEOM = mujoco.mjtGeom
 _NUM_DIRECTIONS = 48
@@ -51,6 +51,17 @@ def heights(
     """
     rows = geom_xmat[surface.geoms, 6:9]
     return geom_xpos[surface.geoms, 2] + (rows * surface.points).sum(-1) - surface.radii
+
+
+def places(
+    surface: Surface, geom_xpos: Float[_Array, "geoms 3"], geom_xmat: Float[_Array, "geoms 9"]
+) -> tuple[Float[_Array, " points"], Float[_Array, " points"]]:
+    """x and y of each point in the world, m. The arguments are those of `heights`."""
+    x, y = (
+        geom_xpos[surface.geoms, axis] + (geom_xmat[surface.geoms, 3 * axis : 3 * axis + 3] * surface.points).sum(-1)
+        for axis in (0, 1)
+    )
+    return x, y
 
 
 def touching_geoms(

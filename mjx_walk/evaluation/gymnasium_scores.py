@@ -154,7 +154,7 @@ def score_in_sim(task: Task, episodes: Episodes, num_episodes: int, seed: int = 
     with undisturbed("finishing the episodes"):
         found = jax.block_until_ready(episodes(jax.random.PRNGKey(seed), num_episodes))
     returns, lengths, measures = jax.tree.map(np.asarray, found)
-    name = f"{task.gymnasium_id} on {task.engine.name}"
+    name = f"{task.gymnasium_id} on {task.engine.name}" + (", on hills" if task.ground.is_on else "")
     if measures and task.terminates_on_fall:
         measures["falls (%)"] = 100 * (lengths < task.max_episode_steps)
     means = {measure: np.asarray(values, np.float64) for measure, values in measures.items()}

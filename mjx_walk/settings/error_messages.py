@@ -127,9 +127,11 @@ def _unfit_recipe(text: str, given: dict[str, str], env: str, algo: str) -> str:
     own = recipe_file(recipe.strip("'")) if recipe else None
     if own:
         return _mistake_in_file(own, text, env, algo)
-    meant_env, _, meant_algo = recipe.rpartition("/")[2].rpartition("_")
+    name = recipe.rpartition("/")[2]
+    meant_algo = max((known for known in ALGORITHMS if name.endswith(f"_{known}")), key=len, default=algo)
+    meant_env = name.removesuffix(f"_{meant_algo}")
     meant = [f"env={meant_env}"] if meant_env in TASKS and meant_env != env else []
-    meant += [f"algo={meant_algo}"] if meant_algo in ALGORITHMS and meant_algo != algo else []
+    meant += [f"algo={meant_algo}"] if meant_algo != algo else []
     hint = f"add {' '.join(meant)}" if meant else fitting_recipes(env, algo)
     return f"recipe={recipe} does not fit env={env} algo={algo}; {hint}"
 

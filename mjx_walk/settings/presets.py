@@ -1,14 +1,13 @@
 """Presets: one override that stands for several settings."""
 
-from mjx_walk.envs.randomization.options import changes, preset
+from mjx_walk.envs.option_presets import changes, preset
+from mjx_walk.envs.task_options import OPTION_PRESETS
 
 __all__ = ["with_presets"]
 
-_KEY = "env.randomize"
-
 
 def with_presets(overrides: list[str]) -> list[str]:
-    """Overrides with `env.randomize=NAME` replaced by the settings of that preset. Later overrides change them.
+    """Overrides with `env.GROUP=NAME` replaced by the settings of that preset. Later overrides change them.
 
     Raises:
         UserError: an unknown preset.
@@ -16,10 +15,11 @@ def with_presets(overrides: list[str]) -> list[str]:
     expanded = []
     for override in overrides:
         key, _, name = override.partition("=")
-        if key != _KEY:
+        presets = OPTION_PRESETS.get(key.removeprefix("env.")) if key.startswith("env.") else None
+        if presets is None:
             expanded.append(override)
             continue
-        for setting, value in changes(preset(name)).items():
+        for setting, value in changes(preset(key, name, presets)).items():
             text = f"[{value[0]},{value[1]}]" if isinstance(value, tuple) else str(value)
-            expanded.append(f"{_KEY}.{setting}={text}")
+            expanded.append(f"{key}.{setting}={text}")
     return expanded

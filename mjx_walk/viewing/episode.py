@@ -123,12 +123,12 @@ def record_episode(
 def make_gymnasium(task: Task, **keywords: Any) -> gymnasium.Env:
     """Make the real Gymnasium environment of a task, with further keywords of `gymnasium.make`.
 
-    A task without an equivalent in Gymnasium runs in its own engine.
+    A task without an equivalent in Gymnasium runs in its own engine, and so does one on hills.
 
     Raises:
         UserError: the model file is gone.
     """
-    if not task.is_in_gymnasium:
+    if not task.is_in_gymnasium or task.ground.is_on:
         return TaskEnv(task, **keywords)
     warn_of_changed_sources(task.model_file, task.model_sources)
     options: dict[str, Any] = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
@@ -165,9 +165,9 @@ def _make_rendered(task: Task, width: int, height: int) -> gymnasium.Env:
 
 
 def _floor_contacts(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Whether each body touches a plane, `[nbody] bool`."""
+    """Whether each body touches a geom of the world, such as the floor, `[nbody] bool`."""
     touches = np.zeros(model.nbody, bool)
     pairs = data.contact.geom[data.contact.dist <= 0.0]
-    is_plane = model.geom_type[pairs] == mujoco.mjtGeom.mjGEOM_PLANE
-    touches[model.geom_bodyid[pairs[is_plane[:, ::-1]]]] = True
+    is_world = model.geom_bodyid[pairs] == 0
+    touches[model.geom_bodyid[pairs[is_world[:, ::-1]]]] = True
     return touches

@@ -14,7 +14,7 @@ from mjx_walk.envs import make_env
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.envs.randomization.edits import scale_strength
 from mjx_walk.envs.randomization.model_pool import change_model
-from mjx_walk.envs.randomization.options import preset
+from mjx_walk.envs.randomization.options import PRESETS
 from mjx_walk.settings.config import load_config
 from mjx_walk.utils.errors import UserError
 
@@ -132,7 +132,7 @@ def test_switched_off_it_leaves_no_trace():
 
 
 def test_an_episode_draws_once():
-    task = make_env("walker2d", "c", randomize=dataclasses.replace(preset("default"), num_models=16))
+    task = make_env("walker2d", "c", randomize=dataclasses.replace(PRESETS["default"], num_models=16))
     state = jax.vmap(task.reset)(jax.random.split(jax.random.PRNGKey(0), 16))
     after = jax.jit(jax.vmap(task.step))(state, jnp.zeros((16, 6)))
     np.testing.assert_array_equal(after.physics.model_index, state.physics.model_index)
@@ -143,7 +143,7 @@ def test_an_episode_draws_once():
 
 def test_a_preset_is_a_start_for_other_settings():
     config = load_config(["env=walker2d", "env.randomize=default", "env.randomize.push=0", "env.randomize.mass=[1,2]"])
-    assert config.env.randomize == dataclasses.replace(preset("default"), push=0.0, mass=(1.0, 2.0))
+    assert config.env.randomize == dataclasses.replace(PRESETS["default"], push=0.0, mass=(1.0, 2.0))
 
 
 @pytest.mark.parametrize(

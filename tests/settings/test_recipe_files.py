@@ -1,7 +1,10 @@
 """`recipe=PATH`: a file of settings of the user's own."""
 
 import pytest
+from helpers import unregistered
 
+from mjx_walk.algos import register_algorithm
+from mjx_walk.algos.ppo import PPO, PPOConfig
 from mjx_walk.experiments.planned_runs import plan
 from mjx_walk.settings.config import load_config
 from mjx_walk.settings.overrides import read_overrides
@@ -89,3 +92,10 @@ def test_recipes_are_swept_and_compared(here):
     with own_hydra() as store:
         swept = with_stored_recipes(read, store)[-1]
     assert swept.startswith("recipe=own_") and swept.endswith(",cpu/ant_ppo")
+
+
+def test_the_hint_names_an_algorithm_with_an_underscore():
+    with unregistered():
+        register_algorithm("my_ppo", PPO, PPOConfig)
+        with pytest.raises(UserError, match=r"does not fit env=humanoid algo=td3; add algo=my_ppo$"):
+            load_config(["env=humanoid", "algo=td3", "recipe=gpu/humanoid_my_ppo"])

@@ -1,0 +1,133 @@
+"""Hills of boxes on the floor of a model: their heights, and the places where episodes start."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+from jaxtyping import Float, PRNGKeyArray
+
+from mjx_walk.envs.ground.options import Ground
+from mjx_walk.envs.ground.profile import FOOT, ROW_LENGTH, Section, sections
+from mjx_walk.machine.quiet_mujoco import hide_deprecations
+from mjx_walk.utils.errors import UserError
+
+__all__ = ["Hills", "with_hills"]
+
+_WIDTH = 32.0
+"""Width of the hills, m."""
+_THICKNESS = 0.5
+"""Of the boxes below their surface, m."""
+_FAR = 1e6
+"""Farther than a body gets, m."""
+_LEAST_GAP = 1e-6
+"""Sections that are closer follow each other, m."""
+_START_WIDTH = 8.0
+"""Width of the places at which bodies with a y coordinate start, m."""
+_SHARED = (
+    *("contype", "conaffinity", "condim", "friction", "priority", "solref", "solimp", "solmix", "margin", "gap"),
+    "group",
+)
+"""Attributes of the floor that the hills share."""
+_PAIR = ("condim", "friction", "solref", "solreffriction", "solimp", "margin", "gap")
+"""Attributes of the floor's contact pairs that those of the hills share."""
+_COLORS = ([0.45, 0.5, 0.45, 1.0], [0.6, 0.65, 0.6, 1.0])
+"""Of neighboring boxes, which show where they end."""
+
+
+class Hills:
+    """Heights of the hills, and the places where episodes start."""
+
+    def __init__(self, ground: Ground):
+        """
+        Args:
+            ground: options of a ground that is not flat.
+        """
+        self._first_rows = min(ground.first_rows, ground.rows)
+        self.sections = sections(ground)
+        ends = [-_FAR, *(part.end for part in self.sections)]
+        starts = [*(part.start for part in self.sections), _FAR]
+        gaps = [pair for pair in zip(ends, starts, strict=True) if pair[1] - pair[0] > _LEAST_GAP]
+        parts = sorted([*self.sections, *(Section(start, end, 0.0, 0.0) for start, end in gaps)])
+        self._starts = jnp.float32([part.start for part in parts])
+        self._first = jnp.float32([part.first for part in parts])
+        self._slopes = jnp.float32([(part.last - part.first) / (part.end - part.start) for part in parts])
+
+    def height(self, x: Float[Array, "*shape"], y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Height of the ground above the floor at some places, m."""
+        part = jnp.searchsorted(self._starts, x, side="right") - 1
+        height = self._first[part] + self._slopes[part] * (x - self._starts[part])
+        return jnp.where(jnp.abs(y) <= _WIDTH / 2, height, 0.0)
+
+    def start(self, key: PRNGKeyArray, has_y: bool) -> Float[Array, " place"]:
+        """Draw the flat foot of a hill: x, m, and y, m, if the body has that coordinate."""
+        row_key, y_key = jax.random.split(key)
+        row = jax.random.randint(row_key, (), 0, self._first_rows)
+        x = ROW_LENGTH * row + FOOT / 2
+        y = jax.random.uniform(y_key, minval=-_START_WIDTH / 2, maxval=_START_WIDTH / 2)
+        return jnp.stack([x, y]) if has_y else x[None]
+
+
+def with_hills(spec: mujoco.MjSpec, hills: Hills) -> mujoco.MjModel:
+    """The model with hills on its floor. Contacts with them are as with the floor.
+
+    The hills come after all other geoms of the world.
+
+    Args:
+        spec: the model, which changes.
+        hills: the hills.
+
+    Raises:
+        UserError: the model has no floor, several floors, or one that is not level.
+    """
+    floor, height = _floor(spec)
+    pairs = [pair for pair in spec.pairs if floor.name and floor.name in (pair.geomname1, pair.geomname2)]
+    for index, section in enumerate(hills.sections):
+        box = _add_box(spec, section, height)
+        box.name, box.rgba = f"hill_{index}", _COLORS[index % 2]
+        for attribute in _SHARED:
+            setattr(box, attribute, getattr(floor, attribute))
+        for pair in pairs:
+            _add_pair(spec, pair, floor.name, box.name)
+    spec.memory = spec.nstack = spec.njmax = spec.nconmax = -1  # MuJoCo chooses
+    with hide_deprecations():
+        return spec.compile()
+
+
+def _add_box(spec: mujoco.MjSpec, section: Section, height: float) -> mujoco.MjsGeom:
+    """Add a box whose upper face is a section, on a floor of some height, m."""
+    length, climb = section.end - section.start, section.last - section.first
+    angle = math.atan2(climb, length)
+    middle = np.array([(section.start + section.end) / 2, 0.0, height + (section.first + section.last) / 2])
+    below = _THICKNESS / 2 * np.array([math.sin(angle), 0.0, -math.cos(angle)])
+    return spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[math.hypot(length, climb) / 2, _WIDTH / 2, _THICKNESS / 2],
+        pos=middle + below,
+        quat=[math.cos(angle / 2), 0.0, -math.sin(angle / 2), 0.0],
+    )
+
+
+def _floor(spec: mujoco.MjSpec) -> tuple[mujoco.MjsGeom, float]:
+    """The plane of the world that bodies can touch, and its height, m."""
+    with hide_deprecations():
+        model = spec.compile()
+    planes = [geom for geom in spec.worldbody.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
+    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)} - {""}
+    floors = [geom for geom in planes if geom.contype or geom.conaffinity or geom.name in paired]
+    if len(floors) != 1:
+        raise UserError(f"env.ground needs one plane that bodies can touch as the floor; the model has {len(floors)}")
+    floor = floors[0]
+    if not np.allclose(model.geom_quat[floor.id, 1:3], 0.0):
+        raise UserError("env.ground needs a level floor; the model's floor is tilted")
+    return floor, float(model.geom_pos[floor.id, 2])
+
+
+def _add_pair(spec: mujoco.MjSpec, pair: mujoco.MjsPair, floor: str, box: str) -> None:
+    """Repeat a contact pair of the floor for a box."""
+    names = [box if name == floor else name for name in (pair.geomname1, pair.geomname2)]
+    added = spec.add_pair(geomname1=names[0], geomname2=names[1])
+    for attribute in _PAIR:
+        setattr(added, attribute, getattr(pair, attribute))

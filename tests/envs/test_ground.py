@@ -1,0 +1,170 @@
+"""Hills: their heights are those of MuJoCo's geoms, and a body is observed and rewarded by its height above them."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import small_robot
+from helpers import slow_except
+
+from mjx_walk.envs import make_env
+from mjx_walk.envs.ground.options import PRESETS, Ground
+from mjx_walk.envs.ground.profile import FOOT, ROW_LENGTH, sections
+from mjx_walk.settings.config import load_config
+from mjx_walk.utils.errors import UserError
+from mjx_walk.viewing.episode import make_gymnasium
+
+TOP = FOOT + (ROW_LENGTH - FOOT) / 2
+"""x of the top of the first hill, m."""
+
+
+def highest(model, x, y):
+    """Height of the highest geom of the world at a place, m. No body is in the way."""
+    data = mujoco.MjData(model)
+    data.geom_xpos[:], data.geom_xmat[:] = model.geom_pos, 0.0
+    for geom in range(model.ngeom):
+        mujoco.mju_quat2Mat(data.geom_xmat[geom], model.geom_quat[geom])
+    data.geom_xpos[model.geom_bodyid > 0] = -9.0
+    return 9.0 - mujoco.mj_ray(model, data, np.array([x, y, 9.0]), -np.eye(3)[2], None, 1, -1, np.zeros(1, np.int32))
+
+
+@pytest.mark.parametrize("kind", PRESETS)
+def test_heights_are_those_of_the_geoms(kind):
+    task = make_env("walker2d", "c", ground=kind)
+    places = np.random.default_rng(0).uniform([-2.0, -17.0], [39.0, 17.0], (300, 2))
+    expected = [highest(task.model, *place) for place in places]
+    assert np.ptp(expected) > 0.03
+    np.testing.assert_allclose(task.ground.height(*jnp.float32(places).T), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", PRESETS)
+def test_hills_get_harder(kind):
+    """Rows of one kind rise from row to row, and the last one has the height of the settings."""
+    ground = PRESETS[kind]
+    heights = np.zeros(ground.rows)
+    for part in sections(ground):
+        row = int(part.start // ROW_LENGTH)
+        heights[row] = max(heights[row], part.first, part.last)
+    kinds = sum(value > 0 for value in (ground.slope, ground.step_height, ground.roughness))
+    assert all(heights[kinds:] > heights[:-kinds] * (1.0 if kind != "rough" else 0.8)) and heights.min() > 0
+    last = {"slopes": 2.4 * np.tan(np.radians(15)), "steps": 6 * 0.1}
+    assert kind not in last or heights[-1] == pytest.approx(last[kind])
+
+
+def test_episodes_start_at_the_feet_of_the_first_rows():
+    task = make_env("humanoid", "c", ground=Ground(step_height=0.2, rows=4, first_rows=3))
+    states = jax.jit(jax.vmap(task.reset))(jax.random.split(jax.random.PRNGKey(0), 64))
+    x, y, z = np.asarray(states.physics.qpos[:, :3]).T
+    assert set(np.round(x)) == {1.0, 9.0, 17.0}
+    assert -4.1 < y.min() < -2 and 2 < y.max() < 4.1
+    np.testing.assert_allclose(z, 1.4, atol=0.011)  # a reset's noise
+    np.testing.assert_allclose(states.obs[:, 0], z)
+
+
+def test_height_counts_from_the_ground():
+    """A walker stands on a top of 1 m, where its height would be too large on the floor."""
+    task = make_env("walker2d", "c", ground=Ground(step_height=0.2, rows=1, first_rows=1), reset_noise_scale=0)
+    qpos = task.init_qpos.at[0].set(TOP).at[1].add(6 * 0.2)
+    state = task.reset_to(qpos, task.init_qvel)
+    assert state.obs[0] == pytest.approx(1.25)
+    after = jax.jit(task.step)(state, jnp.zeros(task.action_size))
+    assert after.physics.qpos[1] > 2.4 and not after.terminated and after.obs[0] == pytest.approx(1.25, abs=0.01)
+    inside = jax.jit(task.step)(task.reset_to(task.init_qpos.at[0].set(TOP), task.init_qvel), jnp.zeros(6))
+    assert inside.terminated
+
+
+@pytest.mark.parametrize("engine", slow_except(["c"], ["c", "warp"]))
+def test_steps_equal_those_of_mujoco(engine):
+    """Walkers fall on ramps, steps and bars."""
+    task = make_env("walker2d", engine, ground=Ground(slope=20.0, step_height=0.15, roughness=0.3, rows=3))
+    rng = np.random.default_rng(0)
+    x = np.float32(rng.uniform(0, 24, 24))
+    height = task.ground.height(jnp.asarray(x), jnp.zeros(24)) + jnp.float32(rng.uniform(0.1, 0.3, 24))
+    qpos = jnp.tile(task.init_qpos, (24, 1)).at[:, 0].set(x).at[:, 1].set(height).at[:, 2].set(1.5)
+    qvel = jnp.float32(rng.normal(size=(24, task.model.nv)))
+    states = jax.jit(jax.vmap(task.reset_to))(qpos, qvel)
+    action = jnp.float32(rng.uniform(-1, 1, (24, task.action_size)))
+    found = jax.jit(jax.vmap(task.step))(states, action).physics.qvel
+    data = mujoco.MjData(task.model)
+    touches = 0
+    for i in range(24):
+        data.qpos[:], data.qvel[:], data.ctrl[:], data.qacc_warmstart[:] = qpos[i], qvel[i], action[i], 0.0
+        mujoco.mj_step(task.model, data, task.num_substeps())
+        touches += any(task.model.geom_type[data.contact.geom[:, 0]] == mujoco.mjtGeom.mjGEOM_BOX)
+        touches += any(task.model.geom_type[data.contact.geom[:, 1]] == mujoco.mjtGeom.mjGEOM_BOX)
+        np.testing.assert_allclose(found[i], data.qvel, rtol=1e-3, atol=2e-3)
+    assert touches > 12
+
+
+def test_a_robot_on_hills(tmp_path):
+    """Its feet touch a hill as they touch the floor, and it has fallen where its torso is in a hill."""
+    robot = small_robot.write(tmp_path, small_robot.small_robot(actuator="motor"))
+    task = make_env("locomotion", "c", xml_file=robot, ground=Ground(step_height=0.1, rows=1, first_rows=1))
+    flat = make_env("locomotion", "c", xml_file=robot)
+    observed = []
+    for one, place, rise in ((flat, 0.0, 0.0), (task, TOP, 0.6)):
+        qpos = one.init_qpos.at[0].set(place).at[2].add(rise)
+        state, step = one.reset_to(qpos, one.init_qvel), jax.jit(one.step)
+        for _ in range(25):
+            state = step(state, jnp.asarray(one.robot.targets, jnp.float32))
+        assert not state.terminated and not state.memory["air_time"].any()
+        observed.append(state.obs)
+    np.testing.assert_allclose(*observed, atol=2e-3)
+    assert step(task.reset_to(task.init_qpos.at[0].set(TOP), task.init_qvel), task.action_low).terminated
+
+
+def test_contact_pairs_of_the_floor_hold_for_the_hills(tmp_path):
+    text = """<mujoco><worldbody>
+      <geom name="floor" type="plane" size="1 1 1" contype="0" conaffinity="0"/>
+      <body name="ball" pos="0 0 1"><freejoint/><geom name="ball" size=".1" contype="0" conaffinity="0"/>
+        <body><joint name="j" range="-9 9"/><geom size=".01" contype="0" conaffinity="0"/></body></body>
+      </worldbody><contact><pair geom1="ball" geom2="floor" condim="1" solref=".03 1"/></contact>
+      <actuator><motor joint="j" ctrlrange="-1 1"/></actuator></mujoco>"""
+    (tmp_path / "m.xml").write_text(text)
+    model = make_env("humanoid_standup", "c", xml_file=str(tmp_path / "m.xml"), ground="slopes").model
+    assert model.npair == 31 and set(model.pair_dim) == {1} and (model.pair_solref == [0.03, 1.0]).all()
+    assert len({tuple(pair) for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)}) == 31
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        (["env.ground=stairs"], "unknown env.ground 'stairs'; choose one of: slopes, steps"),
+        (["env.ground.rows=3"], "env.ground.rows=3 has no effect with env.ground.slope=0.0"),
+        (["env.ground.slope=50"], "env.ground.slope=50"),
+    ],
+)
+def test_mistakes_in_settings_are_one_line(settings, says):
+    with pytest.raises(UserError) as refused:
+        load_config(["env=walker2d", *settings])
+    assert says in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["swimmer", "reacher", "pusher", "inverted_double_pendulum"])
+def test_bodies_that_do_not_walk(name):
+    with pytest.raises(UserError, match=f"the body of {name} cannot climb hills; leave env.ground out"):
+        make_env(name, "c", ground="steps")
+
+
+@pytest.mark.parametrize(
+    ("floor", "says"),
+    [
+        ('<geom type="plane" size="1 1 1"/><geom type="plane" size="1 1 1" pos="0 0 -1"/>', "the model has 2"),
+        ("", "the model has 0"),
+        ('<geom type="plane" size="1 1 1" euler="0 5 0"/>', "the model's floor is tilted"),
+    ],
+)
+def test_a_model_without_a_single_level_floor(floor, says, tmp_path):
+    text = f"""<mujoco><worldbody>{floor}<body><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
+      <joint name="j"/><geom size=".1"/></body></worldbody>
+      <actuator><motor joint="j" ctrlrange="-1 1"/></actuator></mujoco>"""
+    (tmp_path / "m.xml").write_text(text)
+    with pytest.raises(UserError, match=says):
+        make_env("half_cheetah", "c", xml_file=str(tmp_path / "m.xml"), ground="steps")
+
+
+def test_films_show_the_hills_and_scores_leave_them_out():
+    task = make_env("walker2d", "c", ground="steps")
+    assert make_gymnasium(task).unwrapped.model.ngeom == task.model.ngeom > 100
+    assert "ground" not in task.gymnasium_kwargs()
