@@ -16,7 +16,7 @@ from mjx_walk.envs import BUILT_IN_TASKS
 DOCS = Path(__file__).parent
 _OF_SCORES = (
     *("best_evaluations", "complete_episodes", "cpu", "cpu_tasks"),
-    *("mujoco_versions", "robustness", "slm_lab_drafts"),
+    *("hills", "mujoco_versions", "robustness", "slm_lab_drafts"),
 )
 """Tables of measured/ that results.md shows. speed.md shows the others, except that of robots."""
 _ROBOTS = "robots"

@@ -54,8 +54,9 @@ class Terrain:
         return with_hills(spec, self._hills)
 
     def height(self, x: Float[Array, "*shape"], y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Height of the ground above the model's floor at some places, m."""
-        return self._hills.height(x, y) if self._hills else jnp.zeros_like(x)
+        """Height of a ground that is not flat above the model's floor at some places, m."""
+        assert self._hills
+        return self._hills.height(x, y)
 
     def start(self, key: PRNGKeyArray, state: InitialState) -> InitialState:
         """Move the start of an episode to the foot of a hill, which is flat."""

@@ -16,6 +16,7 @@ from mujoco import mjx
 from mjx_walk.envs.physics import body_forces, capsule_frames_warp
 from mjx_walk.envs.physics.base import Derived, PhysicsState, batch_once
 from mjx_walk.envs.physics.derived_arrays import LATE_ARRAYS, derived_shapes, fills_late_arrays
+from mjx_walk.envs.physics.elements import pairs_that_move
 from mjx_walk.envs.physics.mjx_model import (
     chosen_values,
     mjx_values,
@@ -61,6 +62,7 @@ class WarpEngine:
         wp.config.log_level = wp.LOG_ERROR if jax.default_backend() == "cpu" else wp.LOG_WARNING
         self._mj_model = with_newton_solver(model)
         drop_static_pairs(self._mj_model)
+        _use_mujocos_boxes(self._mj_model)
         # `step` returns overflows, so Warp need not print them.
         self._model = mjx.put_model(self._mj_model, impl="warp", device=default_device()).tree_replace(
             {"opt._impl.warn_overflow": 0}
@@ -151,6 +153,17 @@ class WarpEngine:
         shapes = derived_shapes(self._mj_model, body_forces.INPUTS)
         forces = body_forces.body_forces(self._mj_model, read_derived(data, shapes, data.qvel.shape[:1]), data.qvel)
         return derived | {name: forces[name] for name in self._body_forces}
+
+
+def _use_mujocos_boxes(model: mujoco.MjModel) -> None:
+    """Make Warp find contacts of two boxes as MuJoCo does, if boxes may touch. This is all that the flag does in Warp.
+
+    Largest errors of velocities after a step of a box on a box, relative to one plus their change, with a penetration
+    of 2, 10 and 50 mm: 6.5e-2, 0.22 and 2.9 by Warp's default; at most 8.6e-6 so.
+    """
+    geoms, _ = pairs_that_move(model)
+    if (model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_BOX).all(axis=1).any():
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
 
 
 def warp_device(device: jax.Device) -> wp.Device:
