@@ -70,5 +70,5 @@ class HumanoidStandup(HumanoidBody):
         if self.options.version == "v4":
             return {}
         x, y, z = state.physics.qpos[:3]
-        height = {"z_distance_from_origin": z - self.init_qpos[2]}
+        height = {"z_distance_from_origin": z - self.model.qpos0[2]}
         return {"x_position": x, "y_position": y} | height | self.tendon_info(state)

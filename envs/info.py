@@ -1,6 +1,7 @@
 """Gymnasium's `info` dictionaries, as pure functions of states."""
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 
@@ -13,13 +14,14 @@ Info = dict[str, Array]
 """Entries of `info` by name: `[] f32`, or `[n] f32` for tendons."""
 
 
-def plane_position(position: Float[Array, "2"]) -> Info:
+def plane_position(position: Float[Array | np.ndarray, "2"]) -> Info:
     """Entries of a position in the horizontal plane, x and y in m."""
     x, y = position
-    return {"x_position": x, "y_position": y, "distance_from_origin": jnp.linalg.norm(position)}
+    norm = np.linalg.norm if isinstance(position, np.ndarray) else jnp.linalg.norm  # JAX would round it to float32
+    return {"x_position": x, "y_position": y, "distance_from_origin": norm(position)}
 
 
-def plane_velocity(velocity: Float[Array, "2"]) -> Info:
+def plane_velocity(velocity: Float[Array | np.ndarray, "2"]) -> Info:
     """Entries of a velocity in the horizontal plane, m/s."""
     x, y = velocity
     return {"x_velocity": x, "y_velocity": y}
@@ -28,7 +30,8 @@ def plane_velocity(velocity: Float[Array, "2"]) -> Info:
 class GymnasiumInfo:
     """The part of a task that names its equivalent in Gymnasium, and gives Gymnasium's `info`.
 
-    Methods that take states take those of one environment, of a task with `keep_info`.
+    Methods that take states take those of one environment, of a task with `keep_info`. Entries of states in NumPy's
+    float64 are computed in float64.
     """
 
     options: TaskOptions

@@ -78,4 +78,4 @@ class InvertedPendulum(Task):
     def step_info(self, before: State, after: State) -> Info:
         """As in Gymnasium, v5's term is an integer, `[] i32`."""
         info = super().step_info(before, after)
-        return info if self.has_custom_reward else {name: jnp.int32(value) for name, value in info.items()}
+        return info if self.has_custom_reward else {name: value.astype(jnp.int32) for name, value in info.items()}

@@ -84,5 +84,5 @@ class PlanarWalker(HealthyBody, PlanarBody):
         return terms | {"reward_survive": survive}, reward + survive, terminated
 
     def position_info(self, state: State) -> Info:
-        height = {"z_distance_from_origin": state.physics.qpos[1] - self.init_qpos[1]}
+        height = {"z_distance_from_origin": state.physics.qpos[1] - self.model.qpos0[1]}
         return super().position_info(state) | (height if self.options.version == "v5" else {})

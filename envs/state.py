@@ -122,9 +122,9 @@ def physics_state(
 
 
 def in_same_episode(old: State, new: State) -> State:
-    """The new state with the randomness of the old one: its model, its late actions and the time of its next push."""
+    """The new state with the steps of the old one and its randomness: its model, late actions and time of a push."""
     physics = new.physics._replace(model_index=old.physics.model_index)
-    return new.replace(physics=physics, draws=old.draws)
+    return new.replace(physics=physics, draws=old.draws, steps=old.steps)
 
 
 def is_finite(arrays: tuple[Array, ...], limit: float = MAX_ABS_VALUE) -> Bool[Array, ""]:

@@ -46,6 +46,7 @@ PROGRAMS = {
     "in_gymnasium.py": "",
     "in_brax.py": "",
     "with_another_id.py": "",
+    "read_data.py": r"\[.* 0\.\d+\] \d+",
     "train_sb3.py": "",
 }
 """Python blocks that run on their own, with a pattern of what they print."""

@@ -10,6 +10,7 @@ from mjx_walk.envs import State, TaskOptions
 from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.pickling import files_of, warn_of_changed_files
 from mjx_walk.interop.gymnasium_programs import Programs, is_forked, make_programs, refuse_fork
+from mjx_walk.interop.live_data import LiveData
 from mjx_walk.interop.mujoco_attributes import make_gymnasium_env
 
 __all__ = ["CompiledEnv"]
@@ -18,7 +19,7 @@ __all__ = ["CompiledEnv"]
 class CompiledEnv:
     """Compiled programs of a task, and an environment of Gymnasium that draws and renders."""
 
-    _NOT_PICKLED: tuple[str, ...] = ("_gymnasium_env", "_snapshot", "_programs")
+    _NOT_PICKLED: tuple[str, ...] = ("_gymnasium_env", "_snapshot", "_programs", "_data", "_read_data")
 
     _options: TaskOptions
     _physics: str
@@ -26,6 +27,7 @@ class CompiledEnv:
     _state: State | None
     _programs: Programs
     _gymnasium_env: MujocoEnv
+    _read_data: list[LiveData]
 
     def _build(self) -> None:
         """Make the parts that are not pickled."""
@@ -33,6 +35,7 @@ class CompiledEnv:
             self._programs = make_programs(self._options, self._physics)
         self._gymnasium_env = make_gymnasium_env(self._options, self._rendering)
         self._snapshot = ModelSnapshot(self._gymnasium_env.model)
+        self._read_data = []
 
     def _describe(self) -> tuple[gymnasium.Space, gymnasium.Space]:
         """Take over Gymnasium's metadata and render mode. Returns its observation and action space."""
@@ -40,6 +43,19 @@ class CompiledEnv:
         self.metadata = env.metadata | {"render_fps": round(1.0 / env.dt)}
         self.render_mode = env.render_mode
         return env.observation_space, env.action_space
+
+    def _refuse_changes(self) -> None:
+        """Check that neither the model nor `data` has been changed.
+
+        Raises:
+            UserError: one has.
+        """
+        self._snapshot.refuse_changes()
+        self._refuse_changed_data()
+
+    def _refuse_changed_data(self) -> None:
+        for data in self._read_data:
+            data._refuse_changes()
 
     def __getstate__(self) -> dict[str, object]:
         refuse_fork()

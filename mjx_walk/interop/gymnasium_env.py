@@ -7,14 +7,14 @@ arrays, as there, that hold float32 values.
 from typing import Any
 
 import gymnasium
-import jax
 import numpy as np
 
-from mjx_walk.envs import NO_TIME_LIMIT, State, make_options
+from mjx_walk.envs import NO_TIME_LIMIT, State, Task, make_options
 from mjx_walk.envs.state import check_action_shape, in_same_episode
 from mjx_walk.interop.compiled_env import CompiledEnv
-from mjx_walk.interop.gymnasium_info import single_info
-from mjx_walk.interop.gymnasium_programs import refuse_fork
+from mjx_walk.interop.gymnasium_info import on_host, single_info
+from mjx_walk.interop.gymnasium_programs import is_forked, refuse_fork
+from mjx_walk.interop.live_data import Moment, Start
 from mjx_walk.interop.mujoco_attributes import RENDER_MODES, MujocoAttributes, split_keywords
 
 __all__ = ["MjxWalkEnv"]
@@ -23,6 +23,7 @@ __all__ = ["MjxWalkEnv"]
 class MjxWalkEnv(CompiledEnv, MujocoAttributes, gymnasium.Env):
     """One environment. `gymnasium.make` adds the time limit as a wrapper.
 
+    In a forked process, it can be reset. All else raises an error, because JAX does not work there.
     Copies and pickles keep the state and the random generator.
     """
 
@@ -42,6 +43,8 @@ class MjxWalkEnv(CompiledEnv, MujocoAttributes, gymnasium.Env):
         self._options = make_options(env, **options | {"max_episode_steps": NO_TIME_LIMIT})
         self._physics = physics
         self._state: State | None = None
+        self._host_state: State | None = None
+        self._moment = Moment()
         self._build()
         self.observation_space, self.action_space = self._describe()
 
@@ -49,16 +52,20 @@ class MjxWalkEnv(CompiledEnv, MujocoAttributes, gymnasium.Env):
         """Start an episode. A seed gives the start that it gives in Gymnasium, and determines all later episodes.
 
         Raises:
-            UserError: the model has changed.
+            UserError: the model or `data` has changed.
         """
-        refuse_fork()
-        self._snapshot.refuse_changes()
+        self._refuse_changes()
         super().reset(seed=seed)
         self._gymnasium_env.np_random = self.np_random
-        self._gymnasium_env.reset()  # with render_mode="human", it shows the frame as well
+        obs, info = self._gymnasium_env.reset()  # with render_mode="human", it shows the frame as well
+        if is_forked():
+            # A vectorizer's worker reports errors of steps. One of a reset, while it makes the environment, ends it.
+            return np.array(np.float32(obs), np.float64), info
         data = self._gymnasium_env.data
-        self._state, info = self._programs.reset_to(np.float32(data.qpos), np.float32(data.qvel))
-        return np.array(self._state.obs, np.float64), single_info(jax.device_get(info))
+        self._state = self._programs.reset_to(np.float32(data.qpos), np.float32(data.qvel))
+        self._host_state = state = on_host(self._state, data.qpos.copy(), data.qvel.copy())
+        self._moment = Moment(state.physics)
+        return np.array(state.obs, np.float64), single_info(self._task.reset_info(state))
 
     def step(self, action):
         """Step once.
@@ -68,35 +75,52 @@ class MjxWalkEnv(CompiledEnv, MujocoAttributes, gymnasium.Env):
 
         Raises:
             ValueError: the action has another shape.
-            UserError: the model has changed.
+            UserError: the model or `data` has changed.
         """
         refuse_fork()
-        self._snapshot.refuse_changes()
-        if self._state is None:
+        self._refuse_changes()
+        if self._state is None or self._host_state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         check_action_shape(action, (self._gymnasium_env.model.nu,))
-        self._state, info = self._programs.step(self._state, np.asarray(action, np.float32))
-        state, info = jax.device_get((self._state, info))
+        action = np.array(action, np.float32)
+        start = Start(self._state.physics, self._state.draws, self._state.steps)
+        before = self._host_state
+        self._state = self._programs.step(self._state, action)
+        self._host_state = state = on_host(self._state)
+        if not state.metrics["nonfinite"]:  # else the physics stays as it was
+            self._moment = Moment(state.physics, start, action)
         if self.render_mode == "human":
             self.render()
         reward = np.float64(self._programs.reward(state))
-        info = single_info(info, state.metrics)
+        info = single_info(self._task.step_info(before, state), state.metrics)
         return np.array(state.obs, np.float64), reward, bool(state.terminated), False, info
 
     def close(self) -> None:
         """Close the windows and OpenGL contexts."""
         self._close_gymnasium_env()
 
+    @property
+    def _task(self) -> Task:  # type: ignore[override]
+        refuse_fork()
+        return self._programs.task
+
     def _read_state(self) -> State | None:
-        return self._state
+        refuse_fork()
+        return self._host_state
+
+    def _read_moment(self) -> Moment:
+        return self._moment
 
     def _write_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
         refuse_fork()
+        self._refuse_changed_data()
         # As in Gymnasium, the solver's initial guess and activations stay.
         old = self._state
         kept = () if old is None else (old.physics.qacc_warmstart, old.physics.act)
-        new, _ = self._programs.reset_to(qpos, qvel, *kept)
+        new = self._programs.reset_to(np.float32(qpos), np.float32(qvel), *kept)
         self._state = new if old is None else in_same_episode(old, new)
+        self._host_state = on_host(self._state, qpos, qvel)
+        self._moment = self._moment._replace(placed=(qpos, qvel))
 
     def __getstate__(self) -> dict[str, object]:
         return super().__getstate__() | {"_init": (self.init_qpos, self.init_qvel)}

@@ -5,10 +5,31 @@ from collections.abc import Mapping
 import jax
 import numpy as np
 
-__all__ = ["FLAGS", "add_flags", "add_info", "single_info"]
+from mjx_walk.envs import State
+
+__all__ = ["FLAGS", "add_flags", "add_info", "on_host", "single_info"]
 
 FLAGS = ("nonfinite", "overflow")
 """Metrics that `info` holds, as 1.0, only where they are set."""
+
+
+def on_host(state: State, qpos: np.ndarray | None = None, qvel: np.ndarray | None = None) -> State:
+    """A state in NumPy arrays, with physics and memory in float64, so that `info` is computed in float64.
+
+    Args:
+        state: of one environment.
+        qpos: position before it was rounded to float32, `[nq] f64`.
+        qvel: likewise for the velocity, `[nv] f64`.
+    """
+    state = jax.device_get(state)
+    physics, memory = jax.tree.map(_with_double, (state.physics, state.memory))
+    if qpos is not None and qvel is not None:
+        physics = physics._replace(qpos=qpos, qvel=qvel)
+    return state.replace(physics=physics, memory=memory)
+
+
+def _with_double(array: np.ndarray) -> np.ndarray:
+    return np.asarray(array, np.float64) if array.dtype == np.float32 else array
 
 
 def single_info(

@@ -27,8 +27,8 @@ class Programs:
 
     def __init__(self, task: Task):
         self.task = task
-        self.reset_to = jax.jit(self._reset_to)
-        self.step = jax.jit(self._step)
+        self.reset_to = jax.jit(task.reset_to)
+        self.step = jax.jit(task.step)
         self.reset_many = jax.jit(self._reset_many)
         self.step_many = jax.jit(self._step_many, static_argnames="mode")
 
@@ -40,20 +40,6 @@ class Programs:
         terms = [np.asarray(state.metrics[name], np.float64) for name in self.task.reward_terms]
         offset = 0.0 if self.task.reward_hashes else self.task.REWARD_OFFSET
         return np.where(np.asarray(state.metrics["nonfinite"]) > 0, 0.0, sum(terms) + offset)
-
-    def _reset_to(
-        self,
-        qpos: jax.Array,
-        qvel: jax.Array,
-        warmstart: jax.Array | None = None,
-        act: jax.Array | None = None,
-    ) -> tuple[State, Info]:
-        state = self.task.reset_to(qpos, qvel, warmstart, act)
-        return state, self.task.reset_info(state)
-
-    def _step(self, state: State, action: jax.Array) -> tuple[State, Info]:
-        after = self.task.step(state, action)
-        return after, self.task.step_info(state, after)
 
     def _reset_many(self, state: State | None, keys: jax.Array, mask: jax.Array) -> tuple[State, jax.Array, Info]:
         """Reset the environments of a mask, `[B] bool`. Each environment has its own key, `[B, 2] u32`."""

@@ -9,6 +9,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from mjx_walk.envs import State
 from mjx_walk.envs.state import in_same_episode
+from mjx_walk.interop.live_data import Moment
 from mjx_walk.interop.mujoco_attributes import MujocoAttributes
 
 if TYPE_CHECKING:
@@ -22,10 +23,24 @@ class SubEnv(MujocoAttributes):
 
     def __init__(self, vector_env: "MjxWalkVectorEnv", index: int):
         self._vector_env, self._index = vector_env, index
+        self._moment = Moment()
+        self._seen: State | None = None  # the vector environment's state to which the moment belongs
 
     @property
     def _gymnasium_env(self):  # type: ignore[override]
         return self._vector_env._gymnasium_env
+
+    @property
+    def _snapshot(self):  # type: ignore[override]
+        return self._vector_env._snapshot
+
+    @property
+    def _read_data(self):  # type: ignore[override]
+        return self._vector_env._read_data
+
+    @property
+    def _task(self):  # type: ignore[override]
+        return self._vector_env._programs.task
 
     @property
     def render_mode(self) -> str | None:  # type: ignore[override]
@@ -61,12 +76,25 @@ class SubEnv(MujocoAttributes):
     def _read_state(self) -> State | None:
         return jax.tree.map(lambda x: x[self._index], self._vector_env._state)
 
+    def _read_moment(self) -> Moment:
+        env, i = self._vector_env, self._index
+        if env._state is not None and env._state is not self._seen:
+            state, step = jax.device_get(jax.tree.map(lambda x: x[i], (env._state, env._last_step)))
+            # The physics of a finite step has moved; otherwise it is that of a reset, or as it was.
+            has_moved = step is not None and state.steps > 0 and not state.metrics["nonfinite"]
+            moment = Moment(state.physics, *step) if has_moved else Moment(state.physics)
+            self._moment = moment._replace(placed=env._placed.get(i))
+            self._seen = env._state
+        return self._moment
+
     def _write_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
         env, i = self._vector_env, self._index
         if env._state is None:
             raise gymnasium.error.ResetNeeded("call reset before set_state")
+        env._refuse_changed_data()
         old = jax.tree.map(lambda x: x[i], env._state)
         # As in Gymnasium, activations stay.
-        new, _ = env._programs.reset_to(qpos, qvel, old.physics.qacc_warmstart, old.physics.act)
-        new = in_same_episode(old, new).replace(steps=old.steps)
+        new = env._programs.reset_to(np.float32(qpos), np.float32(qvel), old.physics.qacc_warmstart, old.physics.act)
+        new = in_same_episode(old, new)
         env._state = jax.tree.map(lambda x, y: x.at[i].set(y), env._state, new)
+        env._placed[i] = (qpos, qvel)

@@ -17,6 +17,7 @@ from mjx_walk.interop.compiled_env import CompiledEnv
 from mjx_walk.interop.gymnasium_info import add_flags, add_info
 from mjx_walk.interop.gymnasium_programs import refuse_fork
 from mjx_walk.interop.gymnasium_sub_env import SubEnv
+from mjx_walk.interop.live_data import Start
 from mjx_walk.interop.mujoco_attributes import RENDER_MODES, split_keywords
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.value_types import type_problem
@@ -71,6 +72,9 @@ class MjxWalkVectorEnv(CompiledEnv, gymnasium.vector.VectorEnv):
         self._options, self._physics = make_options(env, **_with_gymnasiums_limit(options)), physics
         self.num_envs = num_envs
         self._state: State | None = None
+        # For `data`: what the last step started from, its actions, and arguments of later `set_state`s by environment.
+        self._last_step: tuple[Start, np.ndarray] | None = None
+        self._placed: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._keys: np.ndarray | jax.Array | None = None
         self._seeds: tuple[int, ...] = ()
         self._is_over = np.zeros(num_envs, np.bool_)
@@ -102,7 +106,7 @@ class MjxWalkVectorEnv(CompiledEnv, gymnasium.vector.VectorEnv):
             options: as in `SyncVectorEnv`.
 
         Raises:
-            UserError: the model, `init_qpos` or `init_qvel` has changed.
+            UserError: the model, `data`, `init_qpos` or `init_qvel` has changed.
         """
         self._refuse_changes()
         seeds = self._listed_seeds(seed)
@@ -113,6 +117,7 @@ class MjxWalkVectorEnv(CompiledEnv, gymnasium.vector.VectorEnv):
         mask, before = (np.ones(self.num_envs, np.bool_), None) if mask is None else (mask, self._state)
         self._state, self._keys, reset_info = self._programs.reset_many(before, self._keys, mask)
         self._is_over = self._is_over & ~mask
+        self._placed = {i: placed for i, placed in self._placed.items() if not mask[i]}
         info: dict[str, Any] = {}
         add_info(info, jax.device_get(reset_info), mask)
         return np.array(self._state.obs, np.float64), info
@@ -125,7 +130,7 @@ class MjxWalkVectorEnv(CompiledEnv, gymnasium.vector.VectorEnv):
 
         Raises:
             ValueError: the actions have another shape.
-            UserError: the model, `init_qpos` or `init_qvel` has changed.
+            UserError: the model, `data`, `init_qpos` or `init_qvel` has changed.
         """
         self._refuse_changes()
         if self._state is None:
@@ -134,8 +139,10 @@ class MjxWalkVectorEnv(CompiledEnv, gymnasium.vector.VectorEnv):
         mode, was_over = self.autoreset_mode, self._is_over
         if mode == AutoresetMode.DISABLED:
             assert not was_over.any(), f"reset the finished environments first: {np.flatnonzero(was_over)}"
+        actions = np.array(actions, np.float32)
+        self._last_step, self._placed = (Start(self._state.physics, self._state.draws, self._state.steps), actions), {}
         self._state, last, self._keys, *infos = self._programs.step_many(
-            self._state, np.asarray(actions, np.float32), self._keys, was_over, mode=mode
+            self._state, actions, self._keys, was_over, mode=mode
         )
         returned = self._state if mode == AutoresetMode.NEXT_STEP else last
         obs, outcome, metrics, infos = jax.device_get(
@@ -186,7 +193,7 @@ class MjxWalkVectorEnv(CompiledEnv, gymnasium.vector.VectorEnv):
         self.envs[0]._close_gymnasium_env()
 
     def _refuse_changes(self) -> None:
-        self._snapshot.refuse_changes()
+        super()._refuse_changes()
         for name, value in self._init.items():
             if not np.array_equal(getattr(self._gymnasium_env, name), value):
                 raise UserError(

@@ -13,7 +13,9 @@ from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer, OffScreenViewer
 from gymnasium.envs.registration import load_env_creator
 
-from mjx_walk.envs import TASKS, State, TaskOptions
+from mjx_walk.envs import TASKS, State, Task, TaskOptions
+from mjx_walk.envs.model_changes import ModelSnapshot
+from mjx_walk.interop.live_data import LiveData, Moment, fill
 from mjx_walk.machine.opengl import has_screen
 from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.utils.errors import UserError
@@ -91,13 +93,17 @@ class _Forwarded(Generic[_Value]):
 
 
 class MujocoAttributes:
-    """The attributes of Gymnasium's `MujocoEnv`, except for a live `data`.
+    """The attributes of Gymnasium's `MujocoEnv`.
 
     The physics reads only the state of `set_state` and, at resets of a single environment, `init_qpos` and `init_qvel`.
     Other changes are refused.
     """
 
     _gymnasium_env: MujocoEnv
+    _snapshot: ModelSnapshot
+    _task: Task
+    _data: LiveData | None = None
+    _read_data: list[LiveData]
     render_mode: str | None
 
     model = _Forwarded[mujoco.MjModel]()
@@ -138,8 +144,34 @@ class MujocoAttributes:
         """State of this environment; None before the first reset."""
         raise NotImplementedError
 
+    def _read_moment(self) -> Moment:
+        """What `data` follows from, the same object until it changes."""
+        raise NotImplementedError
+
     def _write_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
         raise NotImplementedError
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """MuJoCo's arrays, one object that follows the environment, as in Gymnasium. Writes to it are refused.
+
+        They are computed when they are read, by MuJoCo's C library on every engine; see `live_data.fill`. An array that
+        is kept changes when `data` is read after the next step, so copy it.
+
+        Raises:
+            UserError: the model or the data have been changed, or the task is on hills, which Gymnasium's model lacks.
+        """
+        if self._task.ground.is_on:
+            raise UserError("data is of Gymnasium's model, which has a flat floor; leave ground out to read it")
+        if self._data is None:
+            self._data = LiveData(self.model, self._read_moment, self._fill)
+            self._read_data.append(self._data)
+        self._data._refresh()
+        return self._data
+
+    def _fill(self, data: mujoco.MjData, moment: Moment) -> None:
+        self._snapshot.refuse_changes()
+        fill(self._task, self.model, data, moment)
 
     def state_vector(self) -> np.ndarray:
         """Position and velocity, `[nq + nv] f64`."""
@@ -149,12 +181,11 @@ class MujocoAttributes:
     def set_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Continue from a position, `[nq]` in m and rad, and a velocity, `[nv]` in m/s and rad/s."""
         assert np.shape(qpos) == (self.model.nq,) and np.shape(qvel) == (self.model.nv,)
-        self._write_state(np.asarray(qpos, np.float32), np.asarray(qvel, np.float32))
+        self._write_state(np.array(qpos, np.float64), np.array(qvel, np.float64))
 
     def get_body_com(self, body_name: str) -> np.ndarray:
-        """Position of a body's frame, `[3] f64`, m."""
-        self._show_state()
-        return self._gymnasium_env.get_body_com(body_name).copy()
+        """Position of a body's frame in the last forward pass, `[3] f64` with float32 values, m."""
+        return np.array(np.float32(self.data.body(body_name).xpos), np.float64)
 
     @property
     def mujoco_renderer(self) -> MujocoRenderer:

@@ -248,12 +248,15 @@ def test_frames_are_gymnasiums(mode):
 
 
 def test_a_forked_process_is_told_to_spawn(monkeypatch):
-    """JAX would wait for ever. A forked worker of `AsyncVectorEnv` still gives its spaces."""
+    """JAX would wait for ever. Spaces and resets, which need no JAX, are given: a worker may ask for them too early."""
+    expected, _ = gymnasium.make("Walker2d-v5").reset(seed=0)
     monkeypatch.setattr(gymnasium_programs, "_process_of_jax", [1])
     env = gymnasium.make("mjx_walk/Walker2d-v5", physics="c")
     assert env.observation_space.shape == (17,)
-    with pytest.raises(gymnasium.error.Error, match=r"vector_kwargs={'context': 'spawn'}"):
-        env.reset()
+    np.testing.assert_array_equal(env.reset(seed=0)[0], np.float32(expected))
+    for call in (lambda: env.step(np.zeros(6)), env.unwrapped.state_vector):
+        with pytest.raises(gymnasium.error.Error, match=r"vector_kwargs={'context': 'spawn'}"):
+            call()
 
 
 @pytest.mark.parametrize("num_envs", [None, 2])

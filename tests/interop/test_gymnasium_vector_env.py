@@ -7,7 +7,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from helpers import renders, slow_except
 from side_by_side import assert_same, make_both
 
@@ -155,17 +155,23 @@ def test_frames():
 @pytest.mark.slow
 @pytest.mark.parametrize("context", ["spawn", "forkserver", None])
 def test_workers(context):
-    """Forked ones, the default on Linux before Python 3.14, cannot use JAX and say so."""
-    keywords = {} if context is None else {"vector_kwargs": {"context": context}}
-    envs = gymnasium.make_vec("mjx_walk/Walker2d-v5", 2, vectorization_mode="async", physics="c", **keywords)
-    if context is None:
-        with pytest.raises(gymnasium.error.Error, match=r"vector_kwargs={'context': 'spawn'}"):
-            envs.reset()
-        return
+    """Forked ones, the default on Linux before Python 3.14, cannot use JAX and say so in the first step."""
+    envs = AsyncVectorEnv([make_and_reset] * 2, context=context)
     obs, _ = envs.reset(seed=3)
     expected, _ = gymnasium.make("Walker2d-v5").reset(seed=3)
     np.testing.assert_allclose(obs[0], expected, atol=1e-6)
+    if context is None:
+        with pytest.raises(gymnasium.error.Error, match=r"vector_kwargs={'context': 'spawn'}"):
+            envs.step(envs.action_space.sample())
+        return
+    envs.step(envs.action_space.sample())
     envs.close()
+
+
+def make_and_reset():
+    env = gymnasium.make("mjx_walk:mjx_walk/Walker2d-v5", physics="c")
+    env.reset()
+    return env
 
 
 def test_what_gymnasiums_own_vector_environment_allows_before_the_first_reset():
