@@ -14,6 +14,7 @@ from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer, OffScreenView
 from gymnasium.envs.registration import load_env_creator
 
 from mjx_walk.envs import TASKS, State, Task, TaskOptions
+from mjx_walk.envs.ground.options import Ground
 from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.interop.live_data import LiveData, Moment, fill
 from mjx_walk.machine.opengl import has_screen
@@ -66,11 +67,13 @@ def make_gymnasium_env(options: TaskOptions, rendering: dict[str, object]) -> Mu
         rendering: values of `RENDER_KEYWORDS`.
 
     Raises:
-        UserError: Gymnasium has no equivalent, or `render_mode="human"` without a screen, with which Gymnasium ends the
-            process.
+        UserError: Gymnasium has no equivalent or no such ground, or `render_mode="human"` without a screen, with which
+            Gymnasium ends the process.
     """
     if not TASKS[options.name][0].has_gymnasium_name():
         raise UserError(f"Gymnasium has no equivalent of {options.name}; step it with mjx_walk.make_env")
+    if options.ground != Ground():
+        raise UserError("Gymnasium's floor is flat; leave ground out, or step the hills with mjx_walk.make_env")
     if rendering.get("render_mode") == "human" and not has_screen():
         raise UserError("render_mode='human' needs a screen; use render_mode='rgb_array'")
     spec = gymnasium.spec(TASKS[options.name][0].id_of(options))
@@ -159,10 +162,8 @@ class MujocoAttributes:
         is kept changes when `data` is read after the next step, so copy it.
 
         Raises:
-            UserError: the model or the data have been changed, or the task is on hills, which Gymnasium's model lacks.
+            UserError: the model or the data have been changed.
         """
-        if self._task.ground.is_on:
-            raise UserError("data is of Gymnasium's model, which has a flat floor; leave ground out to read it")
         if self._data is None:
             self._data = LiveData(self.model, self._read_moment, self._fill)
             self._read_data.append(self._data)
