@@ -28,10 +28,10 @@ _START_WIDTH = 8.0
 """Width of the places at which bodies with a y coordinate start, m."""
 _SHARED = (
     *("contype", "conaffinity", "condim", "friction", "priority", "solref", "solimp", "solmix", "margin", "gap"),
-    "group",
+    *("adhesion", "surfacevel", "group"),
 )
 """Attributes of the floor that the hills share."""
-_PAIR = ("condim", "friction", "solref", "solreffriction", "solimp", "margin", "gap")
+_PAIR = ("condim", "friction", "solref", "solreffriction", "solimp", "margin", "gap", "adhesion")
 """Attributes of the floor's contact pairs that those of the hills share."""
 _COLORS = ([0.45, 0.5, 0.45, 1.0], [0.6, 0.65, 0.6, 1.0])
 """Of neighboring boxes, which show where they end."""

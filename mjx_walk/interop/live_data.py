@@ -35,7 +35,7 @@ _SIGNATURES = {
 
 
 class Start(NamedTuple):
-    """What a step starts from."""
+    """The start of a step."""
 
     physics: PhysicsState
     draws: Draws | None
@@ -45,7 +45,7 @@ class Start(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """What `data` follows from: a reset or a step, and a later `set_state`."""
+    """The origin of `data`: a reset or a step, and a later `set_state`."""
 
     physics: PhysicsState | None = None
     """Physics state after the reset or step. None before the first reset."""

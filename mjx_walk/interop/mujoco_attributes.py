@@ -148,7 +148,7 @@ class MujocoAttributes:
         raise NotImplementedError
 
     def _read_moment(self) -> Moment:
-        """What `data` follows from, the same object until it changes."""
+        """The origin of `data`, the same object until it changes."""
         raise NotImplementedError
 
     def _write_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
