@@ -78,6 +78,7 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         self.model_sources = source_hashes(self.model_file)
         self.body_ids = {body: models.body_id(self.model, body) for body in self.named_bodies()}
         models.check_model(self.model, options.name, self.MODEL_NEEDS)
+        self.ground.check(self.model)
         if options.xml_file:
             models.warn_of_coordinates(self.model, options.name, self.HAS_X, self.HEIGHT_INDEX)
         self.view = self.VIEW._replace(body=min(self.VIEW.body, self.model.nbody - 1))
@@ -190,8 +191,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
 
         Args:
             before: state before the step.
-            physics: physics state after the step.
-            derived: the arrays of `derived_names`, after the step.
+            physics: physics state after the step. On hills, it and `before` have the root's height above the ground.
+            derived: the arrays of `derived_names`, after the step, as they are in the world.
             carry: the task's carry after the step.
             action: in Gymnasium's units.
 
@@ -257,12 +258,12 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         action = jnp.asarray(action, jnp.float32)
         draws, start, control = self.randomizer.disturb(state.draws, state.physics, action)
         physics, derived, overflow = self.engine.step(start, control)
-        seen = self.ground.relative(physics)
-        carry = self.next_carry(state, seen, derived, action) | self._kept(derived)
+        before, seen = state.replace(physics=self.ground.relative(state.physics)), self.ground.relative(physics)
+        carry = self.next_carry(before, seen, derived, action) | self._kept(derived)
         obs = self.randomizer.observe(draws, self.observe_all(seen, derived, carry))
-        terms, reward, terminated = self.reward_and_termination(state, seen, derived, carry, action)
+        terms, reward, terminated = self.reward_and_termination(before, seen, derived, carry, action)
         terms, reward = self._custom_reward(
-            RewardStep(terms, reward, state.physics, physics, obs, action, terminated, self.dt)
+            RewardStep(terms, reward, before.physics, seen, obs, action, terminated, self.dt)
         )
 
         # Activations may be large, as the position that an integrator commands.

@@ -14,12 +14,14 @@ from mjx_walk.envs.ground.profile import FOOT, ROW_LENGTH, Section, sections
 from mjx_walk.machine.quiet_mujoco import hide_deprecations
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["Hills", "with_hills"]
+__all__ = ["Hills", "has_hills", "with_hills"]
 
 _WIDTH = 32.0
 """Width of the hills, m."""
 _THICKNESS = 0.5
 """Of the boxes below their surface, m."""
+_NAME = "hill_"
+"""Start of the names of the boxes."""
 _FAR = 1e6
 """Farther than a body gets, m."""
 _LEAST_GAP = 1e-6
@@ -82,18 +84,30 @@ def with_hills(spec: mujoco.MjSpec, hills: Hills) -> mujoco.MjModel:
     Raises:
         UserError: the model has no floor, several floors, or one that is not level.
     """
-    floor, height = _floor(spec)
+    with hide_deprecations():
+        flat = spec.compile()
+    floor, height = _floor(spec, flat)
+    name = _NAME
+    while any(geom.name.startswith(name) for geom in spec.geoms):
+        name = f"_{name}"
     pairs = [pair for pair in spec.pairs if floor.name and floor.name in (pair.geomname1, pair.geomname2)]
     for index, section in enumerate(hills.sections):
         box = _add_box(spec, section, height)
-        box.name, box.rgba = f"hill_{index}", _COLORS[index % 2]
+        box.name, box.rgba = f"{name}{index}", _COLORS[index % 2]
         for attribute in _SHARED:
             setattr(box, attribute, getattr(floor, attribute))
         for pair in pairs:
             _add_pair(spec, pair, floor.name, box.name)
+    # Cameras see as near as on the flat floor.
+    spec.stat.extent, spec.stat.center = flat.stat.extent, flat.stat.center
     spec.memory = spec.nstack = spec.njmax = spec.nconmax = -1  # MuJoCo chooses
     with hide_deprecations():
         return spec.compile()
+
+
+def has_hills(model: mujoco.MjModel) -> bool:
+    """Whether `with_hills` has made a model."""
+    return any(_NAME in model.geom(geom).name for geom in np.flatnonzero(model.geom_bodyid == 0))
 
 
 def _add_box(spec: mujoco.MjSpec, section: Section, height: float) -> mujoco.MjsGeom:
@@ -110,19 +124,19 @@ def _add_box(spec: mujoco.MjSpec, section: Section, height: float) -> mujoco.Mjs
     )
 
 
-def _floor(spec: mujoco.MjSpec) -> tuple[mujoco.MjsGeom, float]:
-    """The plane of the world that bodies can touch, and its height, m."""
-    with hide_deprecations():
-        model = spec.compile()
-    planes = [geom for geom in spec.worldbody.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
+def _floor(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[mujoco.MjsGeom, float]:
+    """The plane that bodies can touch and that cannot move, and its height, m."""
+    is_plane = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (model.body_weldid[model.geom_bodyid] == 0)
     paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)} - {""}
+    planes = [geom for geom in spec.geoms if is_plane[geom.id]]
     floors = [geom for geom in planes if geom.contype or geom.conaffinity or geom.name in paired]
     if len(floors) != 1:
         raise UserError(f"env.ground needs one plane that bodies can touch as the floor; the model has {len(floors)}")
-    floor = floors[0]
-    if not np.allclose(model.geom_quat[floor.id, 1:3], 0.0):
+    floor, data = floors[0], mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    if not np.isclose(data.geom_xmat[floor.id, 8], 1.0):
         raise UserError("env.ground needs a level floor; the model's floor is tilted")
-    return floor, float(model.geom_pos[floor.id, 2])
+    return floor, float(data.geom_xpos[floor.id, 2])
 
 
 def _add_pair(spec: mujoco.MjSpec, pair: mujoco.MjsPair, floor: str, box: str) -> None:

@@ -8,13 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_walk.envs.ground.options import Ground
+from mjx_walk.utils.errors import UserError
 
 __all__ = ["FOOT", "ROW_LENGTH", "Section", "sections"]
 
-ROW_LENGTH = 8.0
+ROW_LENGTH = 9.0
 """m."""
-FOOT = 2.0
-"""Length of the flat foot of a hill, m."""
+FOOT = 3.0
+"""Length of the flat foot of a hill, on which a humanoid can lie, m."""
 _STEP_DEPTH = 0.4
 """Length of a step, or of a bar, m."""
 _NUM_STEPS = 6
@@ -35,15 +36,24 @@ class Section(NamedTuple):
 
 
 def sections(ground: Ground) -> list[Section]:
-    """The raised parts of a ground that is not flat, in ascending order. The first row starts at x = 0."""
+    """The raised parts of a ground that is not flat, in ascending order. The first row starts at x = 0.
+
+    Kinds of hills take turns. The last hill of each kind has the full height.
+
+    Raises:
+        UserError: there are fewer rows than kinds.
+    """
     kinds = [
         kind
         for kind, size in ((_ramps, ground.slope), (_steps, ground.step_height), (_bars, ground.roughness))
         if size > 0
     ]
+    if ground.rows < len(kinds):
+        raise UserError(f"env.ground.rows={ground.rows} leaves no room for {len(kinds)} kinds of hills; give more rows")
     found: list[Section] = []
     for row in range(ground.rows):
-        hill = kinds[row % len(kinds)](ground, (row + 1) / ground.rows, row)
+        same_kind = range(row % len(kinds), ground.rows, len(kinds))
+        hill = kinds[row % len(kinds)](ground, (same_kind.index(row) + 1) / len(same_kind), row)
         start = ROW_LENGTH * row + FOOT
         found += [part._replace(start=part.start + start, end=part.end + start) for part in hill]
     return found

@@ -5,13 +5,17 @@ import mujoco
 from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
-from mjx_walk.envs.ground.hills import Hills, with_hills
+from mjx_walk.envs.ground.hills import Hills, has_hills, with_hills
 from mjx_walk.envs.ground.options import Ground
+from mjx_walk.envs.models import is_coordinate
 from mjx_walk.envs.physics import PhysicsState
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["Terrain"]
+
+_LARGEST_OFFSET = 1e-6
+"""Of a root's place from its first coordinates, m."""
 
 
 class Terrain:
@@ -33,8 +37,11 @@ class Terrain:
         self._hills = None if is_flat else Hills(ground)
         self._has_y = has_y
         self._height_index = height_index
-        if self._hills and not (has_x and height_index):
-            raise UserError(f"env.ground: the body of {task} cannot climb hills; leave env.ground out")
+        if self._hills and not (has_x and height_index is not None):
+            raise UserError(
+                f"env.ground: {task} has no root that moves along x and up and down (HAS_X and HEIGHT_INDEX of its "
+                "class); leave env.ground out"
+            )
 
     @property
     def is_on(self) -> bool:
@@ -52,6 +59,26 @@ class Terrain:
         """
         assert self._hills
         return with_hills(spec, self._hills)
+
+    def check(self, model: mujoco.MjModel) -> None:
+        """Check that a task's model has the hills, and that its first coordinates are the root's place in the world.
+
+        Raises:
+            UserError: it has not, or they are not.
+        """
+        if not self._hills:
+            return
+        if not has_hills(model):
+            raise UserError(
+                "env.ground: the model has no hills, because load_model of its task does not add them; return "
+                "self.ground.added_to(spec) there"
+            )
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        for axis in range(1 + self._has_y):
+            place = data.xpos[model.jnt_bodyid[0], axis]
+            if not is_coordinate(model, axis, axis) or abs(place - model.qpos0[axis]) > _LARGEST_OFFSET:
+                raise UserError(f"env.ground: qpos[{axis}] of the model is not the root's {'xy'[axis]} in the world")
 
     def height(self, x: Float[Array, "*shape"], y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Height of a ground that is not flat above the model's floor at some places, m."""

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import logging
 import os
 import pickle
 from collections.abc import Callable
@@ -39,6 +40,8 @@ class ScoreRequest:
     backend: str = setting("gymnasium", choices=("gymnasium", "sim"))
     seed: int = setting(0, at_least=0, at_most=MAX_SEED)
 
+
+_LOGGER = logging.getLogger(__name__)
 
 Episodes = Callable[[jax.Array, int], tuple[jax.Array, jax.Array, dict[str, jax.Array]]]
 """`key, N → returns [N] f32, lengths [N] i32, means of the task's measures [N] f32`."""
@@ -83,6 +86,8 @@ def play_in_gymnasium(
         UserError: the model file is gone.
     """
     warn_of_changed_sources(task.model_file, task.model_sources)
+    if task.ground.is_on:
+        _LOGGER.info("Gymnasium's floor is flat; backend=sim scores on the hills")
     episodes = list(zip(seeds, changes or [Perturbation()] * len(seeds), strict=True))
     rounds = [episodes[i : i + _MAX_PARALLEL_EPISODES] for i in range(0, len(episodes), _MAX_PARALLEL_EPISODES)]
     with contextlib.closing(ScoringProgress(len(episodes), len(rounds) * task.max_episode_steps)) as progress:

@@ -8,6 +8,7 @@ from hydra.core.override_parser.types import Override
 
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.envs import TASKS
+from mjx_walk.envs.task_options import OPTION_PRESETS
 from mjx_walk.settings.recipe_files import recipe_file, recipe_settings
 from mjx_walk.settings.recipes import fitting_recipes, recipe_names
 from mjx_walk.settings.schema import chosen, setting_types
@@ -145,6 +146,8 @@ def _mistake_in_file(recipe: Path, text: str, env: str, algo: str) -> str:
     for file, key, value in settings:
         if key in ("env", "algo", "hardware"):
             return f"{file} sets {key}: {value}; write '- override /{key}: {value}' below 'defaults:'"
+        if key.removeprefix("env.") in OPTION_PRESETS:
+            return f"{file}: {key}={value} is for the command line; write the settings of {key} into the file"
         if key not in types and not key.startswith("/"):
             return f"{file}: {unknown_key(key, env, algo)}"
     for file, key, value in settings:

@@ -1,4 +1,4 @@
-"""One episode of a policy in the real Gymnasium, recorded for drawing."""
+"""One episode of a policy, in the real Gymnasium if it has the task, recorded for drawing."""
 
 import dataclasses
 import warnings
@@ -29,6 +29,8 @@ class Episode:
 
     env: str
     """Gymnasium's name of the environment."""
+    is_in_gymnasium: bool
+    """Whether the real Gymnasium played it, not the task's own engine."""
     model: mujoco.MjModel
     seconds_per_step: float
     qpos: np.ndarray
@@ -72,7 +74,7 @@ def record_episode(
     size: tuple[int, int] | None = None,
     frame_rate: float = 30.0,
 ) -> Episode:
-    """Play one episode in the real Gymnasium, or in the task's own engine if Gymnasium has no equal.
+    """Play one episode in the real Gymnasium, or in the task's own engine if Gymnasium has no equal or no hills.
 
     Args:
         task: the environment and its keywords.
@@ -110,6 +112,7 @@ def record_episode(
     env.close()
     return Episode(
         env=task.gymnasium_id,
+        is_in_gymnasium=not isinstance(inner, TaskEnv),
         model=model,
         seconds_per_step=inner.dt,
         view=task.view,

@@ -46,8 +46,9 @@ def write_page(episode: Episode, path: Path) -> Path:
     """
     model = episode.model
     length = f"{len(episode.rewards)} steps, {episode.seconds[-1]:.1f} s"
+    where = ", in the real Gymnasium" if episode.is_in_gymnasium else ""
     data = {
-        "summary": f"return {format_score(episode.rewards.sum())} in {length}, in the real Gymnasium",
+        "summary": f"return {format_score(episode.rewards.sum())} in {length}{where}",
         "num_steps": len(episode.rewards),
         "num_bodies": model.nbody,
         "seconds_per_step": episode.seconds_per_step,

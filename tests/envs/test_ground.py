@@ -11,6 +11,8 @@ from helpers import slow_except
 from mjx_walk.envs import make_env
 from mjx_walk.envs.ground.options import PRESETS, Ground
 from mjx_walk.envs.ground.profile import FOOT, ROW_LENGTH, sections
+from mjx_walk.envs.model_files import model_path
+from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.settings.config import load_config
 from mjx_walk.utils.errors import UserError
 from mjx_walk.viewing.episode import make_gymnasium
@@ -38,25 +40,24 @@ def test_heights_are_those_of_the_geoms(kind):
     np.testing.assert_allclose(task.ground.height(*jnp.float32(places).T), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", PRESETS)
-def test_hills_get_harder(kind):
-    """Rows of one kind rise from row to row, and the last one has the height of the settings."""
-    ground = PRESETS[kind]
-    heights = np.zeros(ground.rows)
-    for part in sections(ground):
-        row = int(part.start // ROW_LENGTH)
-        heights[row] = max(heights[row], part.first, part.last)
-    kinds = sum(value > 0 for value in (ground.slope, ground.step_height, ground.roughness))
-    assert all(heights[kinds:] > heights[:-kinds] * (1.0 if kind != "rough" else 0.8)) and heights.min() > 0
-    last = {"slopes": 2.4 * np.tan(np.radians(15)), "steps": 6 * 0.1}
-    assert kind not in last or heights[-1] == pytest.approx(last[kind])
+@pytest.mark.parametrize(("kind", "last"), [("slopes", 2.4 * np.tan(np.radians(15))), ("steps", 0.6), ("rough", 0.1)])
+def test_hills_of_a_kind_get_harder(kind, last):
+    """Whether the kind is alone or takes turns with others, its last hill has the full height."""
+    for ground, first in ((PRESETS[kind], 0), (PRESETS["mixed"], ["slopes", "steps", "rough"].index(kind))):
+        heights = np.zeros(ground.rows)
+        for part in sections(ground):
+            row = int(part.start // ROW_LENGTH)
+            heights[row] = max(heights[row], part.first, part.last)
+        own = heights if ground is PRESETS[kind] else heights[first::3]
+        assert (np.diff(own) > 0).all() or kind == "rough"
+        assert own[-1] == pytest.approx(last, rel=0.15 if kind == "rough" else 1e-6) and own[0] < 0.5 * last
 
 
 def test_episodes_start_at_the_feet_of_the_first_rows():
     task = make_env("humanoid", "c", ground=Ground(step_height=0.2, rows=4, first_rows=3))
     states = jax.jit(jax.vmap(task.reset))(jax.random.split(jax.random.PRNGKey(0), 64))
     x, y, z = np.asarray(states.physics.qpos[:, :3]).T
-    assert set(np.round(x)) == {1.0, 9.0, 17.0}
+    assert set(np.round(2 * x) / 2) == {1.5, 10.5, 19.5}
     assert -4.1 < y.min() < -2 and 2 < y.max() < 4.1
     np.testing.assert_allclose(z, 1.4, atol=0.011)  # a reset's noise
     np.testing.assert_allclose(states.obs[:, 0], z)
@@ -77,9 +78,9 @@ def test_height_counts_from_the_ground():
 @pytest.mark.parametrize("engine", slow_except(["c"], ["c", "warp"]))
 def test_steps_equal_those_of_mujoco(engine):
     """Walkers fall on ramps, steps and bars."""
-    task = make_env("walker2d", engine, ground=Ground(slope=20.0, step_height=0.15, roughness=0.3, rows=3))
+    task = make_env("walker2d", engine, ground=Ground(slope=20.0, step_height=0.15, roughness=0.2, rows=3))
     rng = np.random.default_rng(0)
-    x = np.float32(rng.uniform(0, 24, 24))
+    x = np.float32(rng.uniform(0, 27, 24))
     height = task.ground.height(jnp.asarray(x), jnp.zeros(24)) + jnp.float32(rng.uniform(0.1, 0.3, 24))
     qpos = jnp.tile(task.init_qpos, (24, 1)).at[:, 0].set(x).at[:, 1].set(height).at[:, 2].set(1.5)
     qvel = jnp.float32(rng.normal(size=(24, task.model.nv)))
@@ -94,7 +95,7 @@ def test_steps_equal_those_of_mujoco(engine):
         touches += any(task.model.geom_type[data.contact.geom[:, 0]] == mujoco.mjtGeom.mjGEOM_BOX)
         touches += any(task.model.geom_type[data.contact.geom[:, 1]] == mujoco.mjtGeom.mjGEOM_BOX)
         np.testing.assert_allclose(found[i], data.qvel, rtol=1e-3, atol=2e-3)
-    assert touches > 12
+    assert touches > 9
 
 
 def test_a_robot_on_hills(tmp_path):
@@ -143,7 +144,7 @@ def test_mistakes_in_settings_are_one_line(settings, says):
 
 @pytest.mark.parametrize("name", ["swimmer", "reacher", "pusher", "inverted_double_pendulum"])
 def test_bodies_that_do_not_walk(name):
-    with pytest.raises(UserError, match=f"the body of {name} cannot climb hills; leave env.ground out"):
+    with pytest.raises(UserError, match=f"env.ground: {name} has no root that moves along x and up and down"):
         make_env(name, "c", ground="steps")
 
 
@@ -162,6 +163,59 @@ def test_a_model_without_a_single_level_floor(floor, says, tmp_path):
     (tmp_path / "m.xml").write_text(text)
     with pytest.raises(UserError, match=says):
         make_env("half_cheetah", "c", xml_file=str(tmp_path / "m.xml"), ground="steps")
+
+
+def test_a_reward_sees_the_height_above_the_ground(tmp_path, monkeypatch):
+    """Also that of the state before the step, so that their difference is a velocity."""
+    (tmp_path / "r.py").write_text("""
+def rise(step):
+    return {"reward_rise": step.after.qpos[1] - step.before.qpos[1], "reward_height": step.after.qpos[1]}
+""")
+    task = make_env("walker2d", "c", ground=Ground(step_height=0.2, rows=1), reward_function=f"{tmp_path}/r.py:rise")
+    state = task.reset_to(task.init_qpos.at[0].set(TOP).at[1].add(6 * 0.2), task.init_qvel)
+    metrics = jax.jit(task.step)(state, jnp.zeros(task.action_size)).metrics
+    assert metrics["reward_height"] == pytest.approx(1.25, abs=0.01) and abs(metrics["reward_rise"]) < 0.01
+
+
+class Overriding(Walker2d):
+    def load_model(self):
+        return mujoco.MjModel.from_xml_path(str(model_path(self.model_file)))
+
+
+def test_an_own_task_whose_model_has_no_hills():
+    options = Walker2dOptions(ground=Ground(slope=10.0))
+    with pytest.raises(
+        UserError, match=r"load_model of its task does not add them; return self.ground.added_to\(spec\)"
+    ):
+        Overriding(options, "c")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [('name="torso" pos="0 0 1.25"', 'name="torso" pos="5 0 1.25"'), ('axis="1 0 0"', 'axis="0 1 0"')]
+)
+def test_a_root_whose_first_coordinate_is_not_its_place(old, new, tmp_path):
+    text = model_path("walker2d_v5.xml").read_text()
+    assert old in text
+    (tmp_path / "m.xml").write_text(text.replace(old, new, 1))
+    with pytest.raises(UserError, match=r"qpos.0. of the model is not the root's x in the world"):
+        make_env("walker2d", "c", xml_file=str(tmp_path / "m.xml"), ground="steps")
+
+
+def test_names_of_the_model_and_its_extent_stay(tmp_path):
+    text = model_path("walker2d_v5.xml").read_text().replace('name="torso_geom"', 'name="hill_3"')
+    assert "hill_3" in text
+    (tmp_path / "m.xml").write_text(text)
+    flat, hilly = (
+        make_env("walker2d", "c", xml_file=str(tmp_path / "m.xml"), ground=one) for one in (Ground(), "steps")
+    )
+    assert hilly.model.stat.extent == flat.model.stat.extent and hilly.model.ngeom == flat.model.ngeom + 110
+
+
+def test_the_last_preset_counts():
+    config = load_config(["env=walker2d", "env.ground=mixed", "env.ground.rows=4", "env.ground=steps"])
+    assert config.env.ground == PRESETS["steps"]
+    with pytest.raises(UserError, match=r"env.ground.rows=2 leaves no room for 3 kinds of hills"):
+        make_env("walker2d", "c", ground=Ground(slope=9.0, step_height=0.1, roughness=0.1, rows=2))
 
 
 def test_films_show_the_hills_and_scores_leave_them_out():

@@ -62,6 +62,10 @@ def test_a_recipe_inherits_from_files_beside_it_and_from_recipes_of_this_package
         ("num_envs: many\n", "own.yaml: num_envs=many: must be an integer"),
         ("num_envs: 0\n", "num_envs=0: must be at least 1"),
         ("env: ant\n", "own.yaml sets env: ant; write '- override /env: ant' below 'defaults:'"),
+        (
+            "env:\n  ground: steps\n",
+            "own.yaml: env.ground=steps is for the command line; write the settings of env.ground",
+        ),
         ("defaults: base\n", "own.yaml: its defaults are not a list; write '- NAME'"),
         ("defaults: [base]\n", "own.yaml inherits from 'base', which is neither a file beside it nor a recipe"),
         ("defaults: [own]\n", "own.yaml inherits from itself"),

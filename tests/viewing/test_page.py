@@ -70,7 +70,7 @@ def test_every_shape_that_is_seen_is_drawn(tmp_path):
     metadata = {"seconds_per_step": 0.1, "body": standing[:, :3], "motor_forces": np.zeros((2, 0)), "view": View()}
     nothing = {"floor_contacts": np.zeros((2, 2), bool), "frames": [], "steps_per_frame": 1}
     terms = {"reward_a</script>": np.ones(2)}
-    made = Episode("Own", model, qpos=standing, rewards=np.ones(2), reward_terms=terms, **metadata, **nothing)
+    made = Episode("Own", False, model, qpos=standing, rewards=np.ones(2), reward_terms=terms, **metadata, **nothing)
     data = read_data(page.write_page(made, tmp_path / "own.html"))
     assert [geom["type"] for geom in data["geoms"]] == ["sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"]
     assert data["geoms"][4]["rgba"] == [1, 0, 0, 0.5] and data["floors"] == [-0.5]
