@@ -27,10 +27,18 @@ def exit_code(name, *arguments):
 
 def test_programs_that_the_documentation_names_are_there(capsys):
     named = {name for text in PAGES.values() for name in re.findall(r"python benchmarks/(\S+\.py)", text)}
-    assert named == {"mujoco_versions.py", "peers.py", "training_parts.py"}
+    assert named == {"hills.py", "mujoco_versions.py", "peers.py", "training_parts.py"}
     for name in named:
         assert exit_code(name, "--help") == 0
         assert capsys.readouterr().out.startswith(f"usage: python benchmarks/{name} ")
+
+
+def test_policies_are_scored_on_hills(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["hills.py", "zoo:hopper-ppo", "--episodes", "2"])
+    runpy.run_path(str(CLONE / "benchmarks" / "hills.py"), run_name="__main__")
+    header, row = capsys.readouterr().out.splitlines()
+    assert header == "Run,slopes,steps,rough,mixed"
+    assert row.startswith("zoo:hopper-ppo,") and all(100 < float(mean) < 3000 for mean in row.split(",")[1:])
 
 
 def test_exported_policies_are_scored_without_this_package(tmp_path):
