@@ -68,3 +68,10 @@ def outcome(wrap, env, num_steps=12):
         return type(error).__name__
     finally:
         env.close()
+
+
+def make_and_reset() -> gymnasium.Env:
+    """A walker that is reset where it is made. Spawned processes import it from here, but not from a test."""
+    env = gymnasium.make("mjx_walk:mjx_walk/Walker2d-v5", physics="c")
+    env.reset()
+    return env

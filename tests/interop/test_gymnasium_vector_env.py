@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from helpers import renders, slow_except
-from side_by_side import assert_same, make_both
+from side_by_side import assert_same, make_and_reset, make_both
 
 from mjx_walk.envs import NO_TIME_LIMIT
 from mjx_walk.utils.errors import UserError
@@ -166,12 +166,6 @@ def test_workers(context):
         return
     envs.step(envs.action_space.sample())
     envs.close()
-
-
-def make_and_reset():
-    env = gymnasium.make("mjx_walk:mjx_walk/Walker2d-v5", physics="c")
-    env.reset()
-    return env
 
 
 def test_what_gymnasiums_own_vector_environment_allows_before_the_first_reset():
