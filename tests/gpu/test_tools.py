@@ -51,6 +51,14 @@ from test_integrators import FEATURES, assert_equal_steps
 assert jax.default_backend() == "gpu"
 assert_equal_steps(feature_models.load(*FEATURES, option='integrator="implicitfast"'), "warp")
 """
+BOXES = """
+import sys
+sys.path[:0] = ["tests", "tests/envs"]
+import jax
+from test_supported import test_boxes_touch_on_warp_as_in_mujoco
+assert jax.default_backend() == "gpu"
+test_boxes_touch_on_warp_as_in_mujoco()
+"""
 BATCHES = """
 import gymnasium
 import numpy as np
@@ -92,6 +100,16 @@ def test_parity(physics, name, version, record_property):
 
 def test_implicitfast_with_activations():
     run_python(IMPLICITFAST, cwd=CLONE)
+
+
+def test_contacts_of_boxes():
+    run_python(BOXES)
+
+
+def test_hills(tmp_path):
+    run("train", *SMALL, "env=walker2d", "env.ground=mixed", "run_dir=run", "total_steps=1", cwd=tmp_path)
+    checked_rows(tmp_path / "run", 1)
+    assert "Walker2d-v5 on warp, on hills: " in run("eval", "run=run", "backend=sim", "episodes=4", cwd=tmp_path)
 
 
 def test_own_task(tmp_path):
