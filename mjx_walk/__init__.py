@@ -15,6 +15,9 @@ __all__ = [
     "__version__",
     "load_run",
     "make_env",
+    "make_rsl_rl_env",
+    "make_sb3_env",
+    "make_torch_env",
     "prepare_jax",
     "register_algorithm",
     "register_task",
@@ -26,12 +29,16 @@ if TYPE_CHECKING:
     from mjx_walk.api import load_run, run
     from mjx_walk.envs import make_env, register_task
     from mjx_walk.interop.brax_env import BraxEnv
+    from mjx_walk.interop.trainer_envs import make_rsl_rl_env, make_sb3_env, make_torch_env
     from mjx_walk.machine.compat import prepare_jax
 
 _WHERE = {
     "BraxEnv": "mjx_walk.interop.brax_env",
     "load_run": "mjx_walk.api",
     "make_env": "mjx_walk.envs",
+    "make_rsl_rl_env": "mjx_walk.interop.trainer_envs",
+    "make_sb3_env": "mjx_walk.interop.trainer_envs",
+    "make_torch_env": "mjx_walk.interop.trainer_envs",
     "prepare_jax": "mjx_walk.machine.compat",
     "register_algorithm": "mjx_walk.algos",
     "register_task": "mjx_walk.envs",

@@ -27,7 +27,7 @@ def exit_code(name, *arguments):
 
 def test_programs_that_the_documentation_names_are_there(capsys):
     named = {name for text in PAGES.values() for name in re.findall(r"python benchmarks/(\S+\.py)", text)}
-    assert named == {"hills.py", "mujoco_versions.py", "peers.py", "training_parts.py"}
+    assert named == {"adapters.py", "hills.py", "mujoco_versions.py", "peers.py", "training_parts.py"}
     for name in named:
         assert exit_code(name, "--help") == 0
         assert capsys.readouterr().out.startswith(f"usage: python benchmarks/{name} ")
@@ -39,6 +39,18 @@ def test_policies_are_scored_on_hills(monkeypatch, capsys):
     header, row = capsys.readouterr().out.splitlines()
     assert header == "Run,slopes,steps,rough,mixed"
     assert row.startswith("zoo:hopper-ppo,") and all(100 < float(mean) < 3000 for mean in row.split(",")[1:])
+
+
+@pytest.mark.slow
+def test_environments_for_other_trainers_are_measured(monkeypatch, capsys):
+    pytest.importorskip("stable_baselines3")
+    arguments = ["--env", "inverted_pendulum", "--num-envs", "8", "--seconds", "0.1", "--rounds", "2"]
+    monkeypatch.setattr(sys, "argv", ["adapters.py", *arguments])
+    runpy.run_path(str(CLONE / "benchmarks" / "adapters.py"), run_name="__main__")
+    header, *rows = (line.split(",") for line in capsys.readouterr().out.splitlines())
+    assert header == ["Environment", "Steps/s", "Ratio"] and rows[0][0] == "training's environment"
+    assert {"make_torch_env", "make_sb3_env"} <= {row[0] for row in rows}
+    assert rows[0][2] == "1.000" and all(int(row[1]) > 0 and float(row[2]) > 0 for row in rows)
 
 
 def test_exported_policies_are_scored_without_this_package(tmp_path):

@@ -48,8 +48,14 @@ PROGRAMS = {
     "with_another_id.py": "",
     "read_data.py": r"\[.* 0\.\d+\] \d+",
     "train_sb3.py": "",
+    "in_torch.py": "",
+    "train_many_sb3.py": "",
+    "in_rsl_rl.py": "",
 }
 """Python blocks that run on their own, with a pattern of what they print."""
+NEEDS = {"train_sb3.py": "stable_baselines3", "train_many_sb3.py": "stable_baselines3", "in_torch.py": "torch"}
+NEEDS |= {"in_rsl_rl.py": "rsl_rl"}
+"""Packages that are installed for campaigns only."""
 
 RUN_BY_OTHER_TESTS = {
     "my_reward.py": "test_own_reward",
@@ -73,8 +79,8 @@ def test_every_python_block_is_run():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_program(name, tmp_path):
-    if "stable_baselines3" in file(name) and importlib.util.find_spec("stable_baselines3") is None:
-        pytest.skip("pip install stable-baselines3")
+    if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
+        pytest.skip(f"{NEEDS[name]} is not installed")
     code = file(name).replace("learn(100_000)", "learn(2_048)")
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=False

@@ -16,7 +16,7 @@ from mjx_walk.envs.info import Info
 from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.machine.compat import prepare_jax
 
-__all__ = ["Programs", "is_forked", "make_programs", "refuse_fork"]
+__all__ = ["Programs", "is_forked", "make_programs", "refuse_fork", "select_rows"]
 
 _process_of_jax: list[int] = []
 """Id of the process in which this module first used JAX."""
@@ -46,7 +46,7 @@ class Programs:
         new_keys, draws = _split_each(keys)
         new = jax.vmap(self.task.reset)(draws)
         if state is not None:
-            new, new_keys = _select(mask, new, state), _select(mask, new_keys, keys)
+            new, new_keys = select_rows(mask, new, state), select_rows(mask, new_keys, keys)
         return new, new_keys, jax.vmap(self.task.reset_info)(new)
 
     def _step_many(
@@ -129,6 +129,6 @@ def _split_each(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
 _Tree = TypeVar("_Tree")
 
 
-def _select(mask: jax.Array, new: _Tree, old: _Tree) -> _Tree:
+def select_rows(mask: jax.Array, new: _Tree, old: _Tree) -> _Tree:
     """Rows of `new` where the mask is set, else of `old`, for all leaves `[B, …]`."""
     return jax.tree.map(lambda x, y: jnp.where(mask.reshape(mask.shape + (1,) * (x.ndim - 1)), x, y), new, old)

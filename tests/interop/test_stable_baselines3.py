@@ -1,8 +1,12 @@
 """Stable-Baselines3 trains on the Gymnasium environments. It is installed for campaigns only."""
 
 import gymnasium
+import numpy as np
 import pytest
 from side_by_side import IDS
+
+import mjx_walk
+from mjx_walk.utils.errors import UserError
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 stable_baselines3 = pytest.importorskip("stable_baselines3", reason="pip install stable-baselines3")
@@ -49,3 +53,46 @@ def test_ppo_learns_to_balance():
     model.learn(4_096)
     after, _ = evaluate_policy(model, real, n_eval_episodes=10)
     assert after > 2 * before
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
+def test_it_trains_on_many_environments_and_goes_on_in_gymnasium(algorithm, tmp_path):
+    env = mjx_walk.make_sb3_env("walker2d", 8, physics="c")
+    settings = {"PPO": {"n_steps": 16, "batch_size": 32}, "SAC": {"learning_starts": 64}}[algorithm]
+    model = getattr(stable_baselines3, algorithm)("MlpPolicy", env, device="cpu", seed=0, **settings).learn(256)
+    assert len(model.ep_info_buffer) > 1 and model.ep_info_buffer[0]["l"] > 5
+    model.save(tmp_path / "model")
+    type(model).load(tmp_path / "model", env=gymnasium.make("Walker2d-v5"), device="cpu").learn(128)
+
+
+def test_infos_tell_ends_by_the_time_limit_apart():
+    env = mjx_walk.make_sb3_env("hopper", 16, physics="c", max_episode_steps=25)
+    env.seed(0)
+    obs, rng, ends = env.reset(), np.random.default_rng(0), []
+    assert obs.dtype == env.observation_space.dtype and obs.shape == (16, 11)
+    for _ in range(60):
+        obs, _, dones, infos = env.step(rng.uniform(-1, 1, (16, 3)))
+        for i in np.flatnonzero(dones):
+            assert infos[i]["terminal_observation"].shape == (11,)
+            assert not np.array_equal(infos[i]["terminal_observation"], obs[i])
+            ends.append((infos[i]["episode"]["l"], infos[i]["TimeLimit.truncated"]))
+        assert all("terminal_observation" not in infos[i] for i in np.flatnonzero(~dones))
+    assert {is_late for length, is_late in ends if length < 25} == {False}
+    assert True in {is_late for length, is_late in ends if length == 25}
+
+
+def test_a_seed_gives_the_same_episodes():
+    first, second = (mjx_walk.make_sb3_env("hopper", 2, physics="c") for _ in range(2))
+    first.seed(5)
+    second.seed(5)
+    np.testing.assert_array_equal(first.reset(), second.reset())
+    assert not np.array_equal(first.reset(), second.reset()[::-1])
+
+
+def test_what_belongs_to_one_environment_is_refused():
+    env = mjx_walk.make_sb3_env("hopper", 2, physics="c")
+    assert env.get_attr("dt") == [0.008] * 2 and env.get_attr("render_mode", 0) == [None]
+    with pytest.raises(UserError, match="cannot be set"):
+        env.set_attr("dt", 0.1)
+    with pytest.raises(UserError, match="cannot be called"):
+        env.env_method("render")

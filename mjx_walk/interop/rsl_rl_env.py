@@ -1,0 +1,54 @@
+"""Many environments as a `VecEnv` of rsl_rl."""
+
+from typing import Any
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from mjx_walk.interop.torch_env import TorchEnv
+
+__all__ = ["RslRlEnv"]
+
+
+class RslRlEnv(VecEnv):
+    """B environments. Their observations are the group `policy`."""
+
+    def __init__(self, env: TorchEnv, seed: int | None = None):
+        self._env = env
+        self.num_envs, self.device = env.num_envs, env.device
+        self.num_actions = env.single_action_space.shape[0]
+        self.max_episode_length = env.max_episode_steps
+        self.cfg: dict[str, Any] = {}
+        obs, _ = env.reset(seed=seed)
+        self._obs = self._grouped(obs)
+
+    def _grouped(self, obs: torch.Tensor) -> TensorDict:
+        return TensorDict({"policy": obs}, batch_size=[self.num_envs], device=self.device)
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:  # type: ignore[override]
+        """Steps of the current episodes, `[B] i64`. rsl_rl sets them to spread the ends of the first episodes."""
+        return self._env.episode_steps.long()
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: torch.Tensor) -> None:
+        self._env.episode_steps = steps
+
+    def get_observations(self) -> TensorDict:
+        """Current observations, `[B, observation_size] f32`."""
+        return self._obs
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Step all environments, and reset those whose episode ends.
+
+        Args:
+            actions: `[B, action_size]`, in Gymnasium's units.
+
+        Returns:
+            Observations after the resets; rewards, `[B] f32`; `[B] i64`, 1 where an episode ends; and `time_outs`,
+            `[B] bool`, where the time limit alone ends it.
+        """
+        obs, reward, terminated, truncated, _ = self._env.step(actions)
+        self._obs = self._grouped(obs)
+        return self._obs, reward, (terminated | truncated).long(), {"time_outs": truncated & ~terminated}

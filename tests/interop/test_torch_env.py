@@ -1,0 +1,149 @@
+"""Trainers in PyTorch: plain, and rsl_rl's. PyTorch is installed for campaigns only."""
+
+import re
+import runpy
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from helpers import CLONE
+
+import mjx_walk
+from mjx_walk.utils.errors import UserError
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+torch = pytest.importorskip("torch", reason="pip install torch")
+
+TASK = {"env": "hopper", "physics": "c", "max_episode_steps": 30}
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Several threads wait for each other while another test runs."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return mjx_walk.make_torch_env(num_envs=8, **TASK)
+
+
+def random_actions(count):
+    return torch.rand(count, 8, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+
+
+def test_steps_are_those_of_gymnasium(env):
+    """A state of ours, set in Gymnasium, leads to the same observations, rewards and end."""
+    real = gymnasium.make("Hopper-v5", max_episode_steps=30)
+    real.reset(seed=0)
+    env.reset(seed=0)
+    physics = env._state.env.physics
+    real.unwrapped.set_state(np.asarray(physics.qpos[0], np.float64), np.asarray(physics.qvel[0], np.float64))
+    for actions in random_actions(30):
+        _, reward, terminated, truncated, info = env.step(actions)
+        obs, expected, is_terminated, _, _ = real.step(actions[0].numpy())
+        np.testing.assert_allclose(info["final_obs"][0], obs, atol=2e-3)
+        assert float(reward[0]) == pytest.approx(expected, abs=2e-3) and bool(terminated[0]) == is_terminated
+        if is_terminated or truncated[0]:
+            break
+    assert is_terminated or truncated[0]
+
+
+def test_tensors_are_the_users_own(env):
+    """Values that a user overwrites or keeps stay apart from the environments."""
+    records = []
+    for overwrites in (False, True):
+        obs, _ = env.reset(seed=1)
+        kept = [obs.clone()]
+        for actions in random_actions(20):
+            if overwrites:
+                obs.fill_(torch.nan)
+            result = env.step(actions)
+            obs = result[0]
+            kept += [value.clone() for value in (*result[:4], result[4]["final_obs"], result[4]["episode"]["r"])]
+            if overwrites:
+                for value in (*result[1:4], result[4]["final_obs"], result[4]["episode"]["r"]):
+                    value.zero_()
+        records.append(kept)
+    assert all(torch.equal(a, b) for a, b in zip(*records, strict=True))
+
+
+def test_kept_tensors_do_not_change(env):
+    obs, _ = env.reset(seed=1)
+    kept = [obs, env.episode_steps]
+    copies = [value.clone() for value in kept]
+    for actions in random_actions(5):
+        env.step(actions)
+    assert all(torch.equal(a, b) for a, b in zip(kept, copies, strict=True))
+
+
+def test_an_end_is_marked_and_described(env):
+    env.reset(seed=0)
+    env.episode_steps = torch.full((8,), 29)
+    obs, _, terminated, truncated, info = env.step(random_actions(1)[0])
+    assert truncated.all() and info["_final_obs"].all() and info["_episode"].all() and not terminated.all()
+    assert info["episode"]["l"].tolist() == [30] * 8 and not torch.equal(obs, info["final_obs"])
+    assert env.episode_steps.tolist() == [0] * 8
+
+
+def test_actions_may_be_of_any_dtype_and_need_gradients(env):
+    env.reset(seed=0)
+    actions = random_actions(1)[0]
+    first = env.step(actions)[0]
+    env.reset(seed=0)
+    again = env.step(actions.double().requires_grad_().t().contiguous().t())[0]
+    assert torch.equal(first, again)
+    with pytest.raises(ValueError, match=r"Expected \(8, 3\), found .*4, 3"):
+        env.step(actions[:4])
+
+
+def test_a_step_needs_a_reset():
+    fresh = mjx_walk.make_torch_env(num_envs=8, **TASK)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        fresh.step(random_actions(1)[0])
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        fresh.episode_steps = torch.zeros(8)
+
+
+@pytest.mark.parametrize(("device", "says"), [("cuda", "JAX computes on cpu"), ("graphics", "choose cpu or cuda")])
+def test_another_device_is_refused(device, says):
+    with pytest.raises(UserError, match=f"^device={device}: {says}"):
+        mjx_walk.make_torch_env(num_envs=8, device=device, **TASK)
+
+
+def test_the_example_learns_to_balance(monkeypatch, capsys):
+    """It is docs/examples/torch_ppo.py, unchanged."""
+    example = CLONE / "docs" / "examples" / "torch_ppo.py"
+    assert len(example.read_text().splitlines()) <= 64
+    monkeypatch.setattr(sys, "argv", [str(example), "inverted_pendulum", "64", "60_000"])
+    runpy.run_path(str(example), run_name="__main__")
+    returns = [float(text) for text in re.findall(r"return ([-\d.]+)", capsys.readouterr().out)]
+    assert returns[0] < 60 and max(returns) > 200
+
+
+def test_rsl_rl_learns_to_balance(capsys, tmp_path):
+    runners = pytest.importorskip("rsl_rl.runners", reason="pip install rsl-rl-lib")
+    env = mjx_walk.make_rsl_rl_env("inverted_pendulum", 64, physics="c", seed=0)
+    runner = runners.OnPolicyRunner(env, rsl_rl_settings(), log_dir=str(tmp_path), device="cpu")
+    runner.learn(30, init_at_random_ep_len=True)
+    lengths = [float(text) for text in re.findall(r"Mean episode length: ([\d.]+)", capsys.readouterr().out)]
+    assert max(lengths) > 5 * lengths[0]
+
+
+def rsl_rl_settings():
+    """Its published PPO settings, with small networks."""
+    network = {"class_name": "MLPModel", "hidden_dims": [32, 32], "activation": "elu", "obs_normalization": True}
+    noise = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "scalar"}
+    ppo = {"class_name": "PPO", "value_loss_coef": 1.0, "use_clipped_value_loss": True, "clip_param": 0.2}
+    ppo |= {"entropy_coef": 0.0, "num_learning_epochs": 5, "num_mini_batches": 4, "learning_rate": 1e-3}
+    ppo |= {"schedule": "adaptive", "gamma": 0.99, "lam": 0.95, "desired_kl": 0.01, "max_grad_norm": 1.0}
+    return {
+        "num_steps_per_env": 24,
+        "save_interval": 1000,
+        "logger": "tensorboard",
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "algorithm": ppo,
+        "actor": network | {"distribution_cfg": noise},
+        "critic": network,
+    }
