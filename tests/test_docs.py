@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers import CLONE
+from helpers import CLONE, PAGES
 
 from mjx_walk.algos import ALGORITHMS, BUILT_IN_ALGORITHMS
 from mjx_walk.envs import TASKS
@@ -63,6 +63,12 @@ def test_every_setting_has_a_meaning():
         missing = {row.name for row in setting_fields.table(schema)} - {*meanings, "name", "env", "algo"}
         assert not missing, schema.__name__
         assert all(meaning.endswith(".") for meaning in meanings.values())
+
+
+def test_settings_of_algorithms_that_pages_name_exist():
+    known = {field.name for _, schema in ALGORITHMS.values() for field in dataclasses.fields(schema)}
+    named = {name for text in PAGES.values() for name in re.findall(r"`algo\.(\w+)[=`]", text)}
+    assert len(named) > 30 and named <= known, named - known
 
 
 def test_every_reward_term_has_its_words():

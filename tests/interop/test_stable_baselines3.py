@@ -1,8 +1,12 @@
 """Stable-Baselines3 trains on the Gymnasium environments. It is installed for campaigns only."""
 
+import inspect
+import re
+
 import gymnasium
 import numpy as np
 import pytest
+from helpers import CLONE
 from side_by_side import IDS
 
 import mjx_walk
@@ -96,3 +100,13 @@ def test_what_belongs_to_one_environment_is_refused():
         env.set_attr("dt", 0.1)
     with pytest.raises(UserError, match="cannot be called"):
         env.env_method("render")
+
+
+@pytest.mark.parametrize(("title", "algorithms"), [("PPO", ["PPO"]), ("SAC and TD3", ["SAC", "TD3"])])
+def test_the_page_of_settings_names_its_own(title, algorithms):
+    page = (CLONE / "docs" / "from_stable_baselines3.md").read_text()
+    section = page.partition(f"## {title}\n")[2].partition("\n## ")[0]
+    named = {*re.findall(r"^\| `(\w+)[=`]", section, re.MULTILINE)}
+    signatures = [inspect.signature(getattr(stable_baselines3, name)) for name in algorithms]
+    known = {name for signature in signatures for name in signature.parameters}
+    assert len(named) > 10 and named <= known
