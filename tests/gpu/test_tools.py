@@ -73,6 +73,26 @@ for _ in range(100):
     total += reward
 print(total.mean())
 """
+TENSORS = """
+import torch
+import mjx_walk
+env = mjx_walk.make_torch_env("humanoid", 256, device="cuda", physics="warp")
+actions = torch.rand(40, 256, 17, device="cuda") * 0.8 - 0.4
+sums = []
+for overwrites in (False, True):
+    obs, _ = env.reset(seed=0)
+    assert obs.is_cuda and obs.shape == (256, 348)
+    sums.append(0.0)
+    for action in actions:
+        if overwrites:
+            obs.fill_(torch.nan)
+        obs, reward, terminated, truncated, info = env.step(action)
+        assert reward.is_cuda and terminated.dtype == torch.bool
+        sums[-1] += info["final_obs"][:, 2].abs().sum().item() + reward.sum().item()
+    assert info["episode"]["l"].max() == 40 > info["episode"]["l"].min()
+assert abs(sums[0] / sums[1] - 1) < 0.05, sums
+print(sums[0])
+"""
 ACTIONS = """
 import sys
 import numpy as np
@@ -185,6 +205,17 @@ def test_onnx_equals_the_policy(tmp_path, record_property):
     difference = np.abs(found - actions).max()
     record_property("measured", f"largest difference {difference:.1e}")
     assert difference < 1e-4
+
+
+def test_pytorch(tmp_path, record_property):
+    """Tensors on the GPU that a user may overwrite, and the example of the documentation."""
+    require("torch")
+    run_python(TENSORS)
+    example = (CLONE / "docs" / "examples" / "torch_ppo.py").read_text()
+    printed = run_python(example, "inverted_pendulum", "256", "1_000_000")
+    returns = [float(text) for text in re.findall(r"return ([-\d.]+)", printed)]
+    record_property("measured", f"returns of the example: {returns[0]:,.0f} to {max(returns):,.0f}")
+    assert max(returns) > 500
 
 
 def test_gymnasium_batch(record_property):
