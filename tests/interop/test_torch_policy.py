@@ -1,0 +1,78 @@
+"""Policies as PyTorch's modules. PyTorch is installed for campaigns only."""
+
+import importlib.util
+import json
+
+import numpy as np
+import pytest
+from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, train_here
+from safetensors import safe_open
+
+import mjx_walk
+from mjx_walk import zoo
+from mjx_walk.interop.torch_policy import MODULE, WEIGHTS, write_policy
+from mjx_walk.utils.errors import UserError
+
+needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="pip install torch")
+
+
+def assert_equal_actions(run, folder):
+    import torch
+
+    torch.set_num_threads(1)
+    spec = importlib.util.spec_from_file_location("policy", folder / MODULE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    observations = np.random.default_rng(1).normal(size=(32, run.task.observation_size))
+    with torch.no_grad():
+        actions = module.Policy(folder / WEIGHTS)(torch.from_numpy(observations)).numpy()
+    assert actions.std() > 1e-3
+    np.testing.assert_allclose(actions, run.policy(observations), atol=1e-5)
+
+
+@pytest.mark.slow
+@needs_torch
+@pytest.mark.parametrize("name", ["humanoid-csac", "pusher-csac", "walker2d-ppo"])
+def test_modules_act_as_policies_of_the_zoo(name, tmp_path):
+    run = mjx_walk.load_run(f"zoo:{name}", physics="c")
+    write_policy(tmp_path, run, {})
+    assert_equal_actions(run, tmp_path)
+    assert len((tmp_path / MODULE).read_text().splitlines()) < 40
+
+
+@pytest.mark.slow
+@needs_torch
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("algo=ppo", "algo.distribution=normal", "algo.activation=elu"),
+        ("algo=ppo", "algo.distribution=normal", "algo.state_dependent_std=true", "algo.observation_clip=null"),
+        ("algo=td3", "algo.policy_layer_norm=true", "algo.policy_hidden_layer_sizes=[16,16]"),
+    ],
+)
+def test_modules_act_as_other_networks(settings, tmp_path):
+    tiny = TINY_OFF_POLICY if "algo=td3" in settings else TINY[1:]
+    train_here(tmp_path / "run", "env=hopper", *settings, f"total_steps={TINY_CALL}", tiny=tiny)
+    run = mjx_walk.load_run(tmp_path / "run", physics="c")
+    write_policy(tmp_path, run, {})
+    assert_equal_actions(run, tmp_path)
+
+
+def test_files_describe_the_policy(tmp_path):
+    run = mjx_walk.load_run("zoo:hopper-csac", physics="c")
+    write_policy(tmp_path, run, {"task": "Hopper-v5"})
+    with safe_open(tmp_path / WEIGHTS, "numpy") as file:
+        metadata, names = file.metadata(), {*file.keys()}
+    assert metadata["task"] == "Hopper-v5" and json.loads(metadata["network"])["sizes"] == [11, 512, 512, 3]
+    assert {"mean", "std", "low", "high", "network.0.weight", "network.4.bias"} < names
+
+
+def test_networks_that_pytorch_lacks_are_refused(tmp_path, monkeypatch):
+    run = mjx_walk.load_run(zoo.open_run("zoo:hopper-csac").path, physics="c")
+    monkeypatch.setattr(run.config.algo, "activation", "gelu")
+    with pytest.raises(UserError, match="no activation 'gelu'"):
+        write_policy(tmp_path, run, {})
+    monkeypatch.setattr(run.config.algo, "activation", "tanh")
+    with pytest.raises(UserError, match="do not give this policy's actions"):
+        write_policy(tmp_path, run, {})
+    assert not [*tmp_path.iterdir()]
