@@ -13,6 +13,11 @@ __all__ = ["Policy"]
 class Policy(nn.Module):
     """Observations `[…, observation_size]` → actions `[…, action_size] f32`."""
 
+    mean: torch.Tensor
+    std: torch.Tensor
+    low: torch.Tensor
+    high: torch.Tensor
+
     def __init__(self, path: str):
         super().__init__()
         with safe_open(path, "pt") as file:
