@@ -1,7 +1,8 @@
-"""`python -m mjx_walk.export run=RUN_DIR`: export a policy to a file that runs without JAX and this package."""
+"""`python -m mjx_walk.export run=RUN_DIR`: export a policy as ONNX, or its episodes as a dataset of Minari."""
 
 import dataclasses
 import json
+import shlex
 from pathlib import Path
 
 import mujoco
@@ -13,24 +14,35 @@ from mjx_walk.envs.motors import joint_of
 from mjx_walk.evaluation.saved_policies import kept_policies
 from mjx_walk.settings.own_tasks import take_task
 from mjx_walk.storage.files import replacing, user_path
+from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import BEST, POLICIES
 from mjx_walk.training.messages import choice_line
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.setting_fields import setting
+from mjx_walk.utils.setting_fields import MAX_SEED, refuse_ineffective, setting
 
 __all__ = ["USAGE", "Arguments", "main"]
 
 USAGE = """
 usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [format=onnx] [dtype=float64|float32]
                                  [out=FILE.onnx]
+       python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=minari [episodes=1000] [seed=0]
+                                 [out=FOLDER]
 
   policy=best     the policy with the highest evaluation during training, the default
   policy=final    the newest policy, which eval scores by default
+  env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
+
+format=onnx, the policy:
   out=FILE.onnx   by default RUN_DIR/policy.onnx, or NAME.onnx in the current folder for a policy of the zoo. The model
                   maps `observation`, [N, observation_size], to `action`, [N, action_size] f32, both in Gymnasium's
                   units. It normalizes observations itself. Its metadata name the task, the policy and the motors.
   dtype=float64   of `observation`: Gymnasium's observations are float64
-  env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
+
+format=minari, a dataset of the policy's episodes in the real Gymnasium, without noise:
+  episodes=1000   complete episodes; those of Humanoid take about 3 MB each
+  seed=N          episode i is reset with N + i
+  out=FOLDER      of datasets, by default Minari's own: $MINARI_DATASETS_PATH or ~/.minari/datasets. The dataset has a
+                  folder of its own below it. An existing dataset is not overwritten.
 """
 
 
@@ -38,16 +50,27 @@ usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [forma
 class Arguments:
     run: str | None = None
     policy: str | None = setting(None, choices=POLICIES)
-    format: str = setting("onnx", choices=("onnx",))
-    dtype: str = setting("float64", choices=("float64", "float32"))
+    format: str = setting("onnx", choices=("onnx", "minari"))
+    dtype: str = setting("float64", choices=("float64", "float32"), only_if={"format": "onnx"})
+    episodes: int = setting(1000, at_least=1, only_if={"format": "minari"})
+    seed: int = setting(0, at_least=0, at_most=MAX_SEED, only_if={"format": "minari"})
     out: str | None = None
 
 
 def main(command_line: list[str]) -> None:
-    """Write the file."""
-    arguments = parsing.parse(Arguments, take_task(command_line), USAGE)
+    """Write the file or the dataset."""
+    own = take_task(command_line)
+    arguments = parsing.parse(Arguments, own, USAGE)
+    refuse_ineffective(arguments, [argument.partition("=")[0] for argument in own])
     parsing.stay_on_cpu()
     folder = zoo.open_run(arguments.run)
+    run = _export_minari(arguments, folder) if arguments.format == "minari" else _export_onnx(arguments, folder)
+    if arguments.policy is None and len(kept_policies(folder)) > 1:
+        print(choice_line(run.policy_name))
+
+
+def _export_onnx(arguments: Arguments, folder: RunFolder) -> Run:
+    """Write the policy as ONNX, and say where it is."""
     try:
         import onnx
 
@@ -65,8 +88,30 @@ def main(command_line: list[str]) -> None:
         onnx.save(model, str(new))
     print(f"{path}: observation [N, {run.task.observation_size}] → action [N, {run.task.action_size}]")
     print(f"It holds the {run.policy_name} policy (step {run.policy_metadata['env_steps']:,}).")
-    if arguments.policy is None and len(kept_policies(folder)) > 1:
-        print(choice_line(run.policy_name))
+    return run
+
+
+def _export_minari(arguments: Arguments, folder: RunFolder) -> Run:
+    """Write a dataset of the policy's episodes, and say how to load it."""
+    try:
+        import h5py  # noqa: F401  # Minari imports it late
+        from minari.storage import get_dataset_path
+
+        from mjx_walk.interop.minari import check_absent, check_task, dataset_id, write_dataset
+    except ImportError as error:
+        raise UserError("format=minari needs Minari: pip install 'minari[hdf5]'") from error
+    root = user_path(arguments.out) if arguments.out else get_dataset_path()
+    run = load_run(folder.path, "c", arguments.policy or BEST)
+    check_task(run)
+    path = root / dataset_id(run)
+    check_absent(path)
+    parsing.check_writable(path)
+    scores = write_dataset(root, run, arguments.episodes, arguments.seed)
+    print(f"{path}: episodes of the {run.policy_name} policy (step {run.policy_metadata['env_steps']:,})")
+    print(f"{scores}", "Load it in a shell and in Python:", sep="\n")
+    print(f"  export MINARI_DATASETS_PATH={shlex.quote(str(root.absolute()))}")
+    print(f'  dataset = minari.load_dataset("{dataset_id(run)}")')
+    return run
 
 
 def _metadata(run: Run) -> dict[str, str]:

@@ -127,7 +127,7 @@ def test_scores_in_the_engine_compile_once(finished, monkeypatch):
 def test_many_episodes_are_played_in_rounds(finished, monkeypatch):
     run, _ = finished
     at_once = run.evaluate(5, seed=3)
-    monkeypatch.setattr("mjx_walk.evaluation.gymnasium_scores._MAX_PARALLEL_EPISODES", 2)
+    monkeypatch.setattr("mjx_walk.evaluation.gymnasium_scores.MAX_PARALLEL_EPISODES", 2)
     in_rounds = run.evaluate(5, seed=3)
     assert in_rounds.seeds == at_once.seeds == [3, 4, 5, 6, 7]
     assert in_rounds.returns == pytest.approx(at_once.returns, rel=1e-6)

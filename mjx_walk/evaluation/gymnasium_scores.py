@@ -2,12 +2,7 @@
 
 import contextlib
 import dataclasses
-import logging
-import os
-import pickle
 from collections.abc import Callable
-from subprocess import PIPE, Popen
-from typing import Any
 
 import jax
 import numpy as np
@@ -15,21 +10,16 @@ from jaxtyping import Float, Int
 
 from mjx_walk.common.rollout import evaluate
 from mjx_walk.envs import Task
-from mjx_walk.envs.models import warn_of_changed_sources
 from mjx_walk.envs.randomization.options import Randomization
-from mjx_walk.evaluation.gymnasium_worker import send
+from mjx_walk.evaluation.gymnasium_episodes import MAX_PARALLEL_EPISODES, ParallelEpisodes, warn_of_differences
 from mjx_walk.evaluation.perturbations import Perturbation
 from mjx_walk.logs.progress import ScoringProgress
 from mjx_walk.machine.signals import undisturbed
-from mjx_walk.machine.subprocesses import start_module
 from mjx_walk.storage.scores import Scores
 from mjx_walk.utils.setting_fields import MAX_SEED, setting
 from mjx_walk.utils.types import Act, PolicyFn
 
 __all__ = ["Episodes", "ScoreRequest", "compile_episodes", "play_in_gymnasium", "score_in_gymnasium", "score_in_sim"]
-
-_MAX_PARALLEL_EPISODES = 1024
-"""Episodes played at once; an environment takes about 1 MB."""
 
 
 @dataclasses.dataclass
@@ -40,8 +30,6 @@ class ScoreRequest:
     backend: str = setting("gymnasium", choices=("gymnasium", "sim"))
     seed: int = setting(0, at_least=0, at_most=MAX_SEED)
 
-
-_LOGGER = logging.getLogger(__name__)
 
 Episodes = Callable[[jax.Array, int], tuple[jax.Array, jax.Array, dict[str, jax.Array]]]
 """`key, N → returns [N] f32, lengths [N] i32, means of the task's measures [N] f32`."""
@@ -85,11 +73,9 @@ def play_in_gymnasium(
     Raises:
         UserError: the model file is gone.
     """
-    warn_of_changed_sources(task.model_file, task.model_sources)
-    if task.ground.is_on:
-        _LOGGER.info("Gymnasium's floor is flat; backend=sim scores on the hills")
+    warn_of_differences(task)
     episodes = list(zip(seeds, changes or [Perturbation()] * len(seeds), strict=True))
-    rounds = [episodes[i : i + _MAX_PARALLEL_EPISODES] for i in range(0, len(episodes), _MAX_PARALLEL_EPISODES)]
+    rounds = [episodes[i : i + MAX_PARALLEL_EPISODES] for i in range(0, len(episodes), MAX_PARALLEL_EPISODES)]
     with contextlib.closing(ScoringProgress(len(episodes), len(rounds) * task.max_episode_steps)) as progress:
         played = [_play_round(task, act, some, progress, number) for number, some in enumerate(rounds)]
     returns, lengths = zip(*played, strict=True)
@@ -101,45 +87,18 @@ def _play_round(
 ) -> tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"]]:
     """Play episodes in parallel, each with its seed and its changes; their returns and lengths."""
     steps_before = rounds_before * task.max_episode_steps
-    keywords = task.gymnasium_kwargs() | {"max_episode_steps": task.options.max_episode_steps}
+    num_before = rounds_before * MAX_PARALLEL_EPISODES
     returns, lengths = np.zeros(len(episodes)), np.zeros(len(episodes), np.int64)
     is_over = np.zeros(len(episodes), bool)
-    shares = [share for share in np.array_split(np.arange(len(episodes)), os.cpu_count() or 1) if share.size]
-    with contextlib.ExitStack() as stack:
-        # `multiprocessing` would import the user's main module a second time.
-        workers = [
-            stack.enter_context(start_module("evaluation.gymnasium_worker", stdin=PIPE, stdout=PIPE)) for _ in shares
-        ]
-        for worker, share in zip(workers, shares, strict=True):
-            _send(
-                worker,
-                (task.gymnasium_id, keywords, [(seed, tuple(change)) for seed, change in (episodes[i] for i in share)]),
-            )
-        obs = np.concatenate([_receive(worker) for worker in workers])
+    with ParallelEpisodes(task, episodes) as playing:
+        obs = playing.starts.obs
         while not is_over.all():
-            actions = np.asarray(act(obs.astype(np.float32)))
             lengths += ~is_over
-            for worker, share in zip(workers, shares, strict=True):
-                _send(worker, actions[share])
-            for worker, share in zip(workers, shares, strict=True):
-                obs[share], rewards, is_over[share] = _receive(worker)
-                returns[share] += rewards
-            num_before = rounds_before * _MAX_PARALLEL_EPISODES
+            steps = playing.step(np.asarray(act(obs.astype(np.float32))))
+            obs, is_over = steps.obs, steps.terminated | steps.truncated
+            returns += steps.rewards
             progress.update(steps_before + int(lengths.max()), num_before + int(is_over.sum()))
     return returns, lengths
-
-
-def _send(worker: Popen, message: object) -> None:
-    assert worker.stdin
-    send(worker.stdin, message)
-
-
-def _receive(worker: Popen) -> Any:
-    assert worker.stdout
-    try:
-        return pickle.load(worker.stdout)
-    except EOFError:
-        raise RuntimeError("a Gymnasium process ended; its error is above") from None
 
 
 def compile_episodes(task: Task, policy: PolicyFn) -> Episodes:

@@ -1,16 +1,16 @@
 """A child process that steps real Gymnasium environments; threads would block each other on Python's lock.
 
-It exchanges pickles with its parent over pipes. It first reads `(env id, keywords, [(seed, changes)])`, where the
-changes are the fields of a `Perturbation`, and answers with the reset observations. Then it reads actions, and answers
-with observations, rewards and which episodes are over, until the input ends. Environments whose episode is over are not
-stepped.
+It exchanges pickles with its parent over pipes. It first reads `(env id, keywords, [(seed, changes)], with_infos)`,
+where the changes are the fields of a `Perturbation`, and resets the environments. Then it reads actions, until the
+input ends. Each answer holds observations, rewards, which episodes have terminated, which are truncated, and infos.
+Environments whose episode is over are not stepped.
 """
 
 import os
 import pickle
 import sys
 import warnings
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -40,23 +40,28 @@ def serve() -> None:
 
     write_no_log()
     gymnasium.logger.min_level = gymnasium.logger.ERROR
-    name, keywords, episodes = pickle.load(sys.stdin.buffer)
+    name, keywords, episodes, with_infos = pickle.load(sys.stdin.buffer)
     with hide_deprecations():
         envs = [gymnasium.make(name, **keywords) for _ in episodes]
     for env, (seed, changes) in zip(envs, episodes, strict=True):
         mujoco_env = env.unwrapped
         assert isinstance(mujoco_env, MujocoEnv)
         perturb(mujoco_env, Perturbation(*changes), seed)
-    obs = np.stack([env.reset(seed=seed)[0] for env, (seed, _) in zip(envs, episodes, strict=True)])
-    is_over = np.zeros(len(envs), bool)
-    send(answers, obs)
+    starts = [env.reset(seed=seed) for env, (seed, _) in zip(envs, episodes, strict=True)]
+    obs, infos = np.stack([start for start, _ in starts]), [info for _, info in starts]
+    terminated, truncated = np.zeros((2, len(envs)), bool)
+    send(answers, (obs, np.zeros(len(envs)), terminated, truncated, _stacked(infos) if with_infos else {}))
     while True:
         actions = pickle.load(sys.stdin.buffer)
         rewards = np.zeros(len(envs))
-        for i in np.flatnonzero(~is_over):
-            obs[i], rewards[i], terminated, truncated, _ = envs[i].step(actions[i])
-            is_over[i] = terminated or truncated
-        send(answers, (obs, rewards, is_over))
+        for i in np.flatnonzero(~(terminated | truncated)):
+            obs[i], rewards[i], terminated[i], truncated[i], infos[i] = envs[i].step(actions[i])
+        send(answers, (obs, rewards, terminated, truncated, _stacked(infos) if with_infos else {}))
+
+
+def _stacked(infos: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """The entries of all environments' `info`, which hold numbers: `[N, …] f64` by name."""
+    return {name: np.array([info[name] for info in infos], np.float64) for name in infos[0]}
 
 
 def send(pipe: IO[bytes], message: object) -> None:

@@ -186,16 +186,17 @@ class Progress:
 class ScoringProgress:
     """Steps of episodes that are played side by side: a bar in a terminal, and else a message every ten seconds."""
 
-    def __init__(self, num_episodes: int, max_steps: int):
+    def __init__(self, num_episodes: int, max_steps: int, stage: str = "scoring"):
         """
         Args:
-            num_episodes: episodes to score.
+            num_episodes: episodes to play.
             max_steps: steps until the last of them ends at the latest.
+            stage: what they are played for.
         """
         self._num_episodes = num_episodes
         self._max_steps = max_steps
         self._is_terminal = _is_terminal()
-        self._bar = _make_bar("scoring", max_steps, 0, self._is_terminal)
+        self._bar = _make_bar(stage, max_steps, 0, self._is_terminal)
         self._started = self._last_line = time.monotonic()
         self._first = 0
         """Steps at which the time starts. The first step compiles the policy."""
@@ -217,6 +218,6 @@ class ScoringProgress:
             _LOGGER.info("  step %s of %s, %s, at most %s left", f"{steps:,}", f"{self._max_steps:,}", episodes, left)
 
     def close(self) -> None:
-        """Remove the bar; the scores follow."""
+        """Remove the bar; the result follows."""
         self._bar.leave = False
         self._bar.close()

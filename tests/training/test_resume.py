@@ -290,9 +290,9 @@ def test_a_gymnasium_process_whose_parent_is_gone_ends_quietly():
     worker = start_module(
         "evaluation.gymnasium_worker", stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
-    pickle.dump(("Walker2d-v5", {}, [(0, ())]), worker.stdin)
+    pickle.dump(("Walker2d-v5", {}, [(0, ())], False), worker.stdin)
     worker.stdin.flush()
-    assert pickle.load(worker.stdout).shape == (1, 17)
+    assert pickle.load(worker.stdout)[0].shape == (1, 17)
     worker.stdout.close()
     pickle.dump(np.zeros((1, 6)), worker.stdin)
     worker.stdin.close()

@@ -1,0 +1,160 @@
+"""Datasets of a policy's episodes for Minari, the library of offline reinforcement learning beside Gymnasium."""
+
+import contextlib
+import copy
+import dataclasses
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import gymnasium
+import minari
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from minari import EpisodeMetadataCallback
+from minari.data_collector.episode_buffer import EpisodeBuffer
+from minari.dataset.minari_storage import MinariStorage
+from minari.namespace import NAMESPACE_METADATA_FILENAME
+
+from mjx_walk import zoo
+from mjx_walk.envs import Task
+from mjx_walk.envs.model_files import is_asset
+from mjx_walk.evaluation.recorded_episodes import RecordedEpisode, record_episodes
+from mjx_walk.evaluation.saved_policies import SavedPolicy
+from mjx_walk.storage.files import write_text
+from mjx_walk.storage.folders import replacing_folder
+from mjx_walk.storage.scores import Scores
+from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.versions import package_versions
+from mjx_walk.viewing.episode import make_gymnasium
+
+__all__ = ["check_absent", "check_task", "dataset_id", "write_dataset"]
+
+_NAMESPACE = "mjx_walk"
+_REQUIREMENTS = ("mujoco", "gymnasium")
+"""Packages whose versions the episodes depend on. Minari warns if another version is installed."""
+
+
+def dataset_id(saved: SavedPolicy) -> str:
+    """Minari's id of a policy's dataset, such as `mjx_walk/walker2d/csac-v0` from the zoo.
+
+    A run gives `mjx_walk/walker2d/csac-best-v0` or `…/csac-final-v0`.
+    """
+    task, algorithm = saved.config.env.name, saved.config.algo.name
+    name = saved.path.name.removeprefix(f"{task}-") if zoo.holds(saved.path) else f"{algorithm}-{saved.policy_name}"
+    return f"{_NAMESPACE}/{task}/{name}-v0"
+
+
+def check_absent(path: Path) -> None:
+    """Check that there is no such dataset yet, which is never overwritten.
+
+    Raises:
+        UserError: there is.
+    """
+    if path.exists():
+        raise UserError(f"{path} exists already; choose another out=, or remove it")
+
+
+def check_task(saved: SavedPolicy) -> None:
+    """Check that a dataset can name the environment, so that Minari makes it again anywhere.
+
+    Raises:
+        UserError: Gymnasium does not have the task, or its model is the user's own file.
+    """
+    task = saved.task
+    if not task.is_in_gymnasium:
+        raise UserError(f"Gymnasium has no {task.gymnasium_id}, whose episodes Minari would replay; choose format=onnx")
+    xml_file = task.options.xml_file
+    if xml_file and not is_asset(xml_file):
+        raise UserError(
+            f"a dataset cannot hold the model {xml_file}, with which Minari would replay; choose format=onnx"
+        )
+
+
+def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int) -> Scores:
+    """Play a policy in the real Gymnasium, and write its episodes as a dataset of Minari.
+
+    The dataset appears below `root` when it is complete. The policy acts without noise.
+
+    Args:
+        root: folder of datasets, as in `MINARI_DATASETS_PATH`.
+        saved: the policy, which `check_task` allows.
+        num_episodes: N.
+        seed: episode i is reset with `seed + i`.
+
+    Returns:
+        The returns and lengths of the episodes.
+
+    Raises:
+        UserError: the dataset exists already.
+        OSError: the disk is full, or cannot be written.
+    """
+    path = root.absolute() / dataset_id(saved)  # Minari measures the size of absolute paths only
+    check_absent(path)
+    namespaces = (path.parent, path.parent.parent)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with replacing_folder(path) as folder:
+            scores = _write(folder / "data", saved, [seed + i for i in range(num_episodes)])
+        for namespace in namespaces:
+            if not (namespace / NAMESPACE_METADATA_FILENAME).exists():
+                write_text(namespace / NAMESPACE_METADATA_FILENAME, "{}")
+    finally:
+        for namespace in namespaces:
+            with contextlib.suppress(OSError):
+                namespace.rmdir()  # if it is empty
+    return scores
+
+
+def _write(folder: Path, saved: SavedPolicy, seeds: list[int]) -> Scores:
+    """Write the files of a dataset."""
+    with contextlib.closing(make_gymnasium(saved.task)) as env:
+        storage = MinariStorage.new(folder, env.observation_space, env.action_space, _portable_spec(env, saved.task))
+    rewards: list[np.ndarray] = []
+    with contextlib.closing(record_episodes(saved.task, saved.act, seeds)) as episodes:
+        storage.update_episodes(_buffers(episodes, rewards))
+    storage.update_episode_metadata(map(EpisodeMetadataCallback(), ({"rewards": own} for own in rewards)))
+    returns, lengths = np.array([own.sum() for own in rewards]), np.array([len(own) for own in rewards])
+    scores = Scores(returns, lengths, seeds, saved.task.gymnasium_id)
+    storage.update_metadata(_metadata(saved, scores))
+    return scores
+
+
+def _portable_spec(env: gymnasium.Env, task: Task) -> EnvSpec:
+    """The environment's specification, with the name of one of Gymnasium's models in place of its path."""
+    spec = copy.deepcopy(env.spec)
+    assert spec
+    if task.options.xml_file:
+        spec.kwargs["xml_file"] = task.options.xml_file
+    return spec
+
+
+def _buffers(episodes: Iterable[RecordedEpisode], rewards: list[np.ndarray]) -> Iterator[EpisodeBuffer]:
+    """Episodes as Minari takes them. Their rewards are appended to a list."""
+    for episode in episodes:
+        rewards.append(episode.rewards)
+        yield EpisodeBuffer(**{field.name: getattr(episode, field.name) for field in dataclasses.fields(episode)})
+
+
+def _metadata(saved: SavedPolicy, scores: Scores) -> dict[str, object]:
+    """Facts about the dataset: Minari's own, and those that Minari has no name for under `mjx_walk`."""
+    policy, env_steps = saved.policy_name, saved.policy_metadata["env_steps"]
+    source = f"{zoo.PREFIX if zoo.holds(saved.path) else ''}{saved.path.name}"  # the path may name the user
+    versions = package_versions()
+    return {
+        "dataset_id": dataset_id(saved),
+        "minari_version": minari.__version__,
+        "algorithm_name": saved.config.algo.name,
+        "description": f"Episodes of the {policy} policy of {source} in {scores.env}, without noise.",
+        "requirements": [f"{name}=={versions[name]}" for name in _REQUIREMENTS],
+        "mjx_walk": {
+            "run": source,
+            "policy": policy,
+            "env_steps": env_steps,
+            "backend": "gymnasium",
+            "action_noise": "none",
+            "seed": scores.seeds[0],
+            "mean_return": scores.mean,
+            "std_return": scores.std,
+            "versions": versions,
+        },
+    }
