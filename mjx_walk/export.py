@@ -100,9 +100,9 @@ def _export_minari(arguments: Arguments, folder: RunFolder) -> Run:
         from mjx_walk.interop.minari import check_absent, check_task, dataset_id, write_dataset
     except ImportError as error:
         raise UserError("format=minari needs Minari: pip install 'minari[hdf5]'") from error
-    root = user_path(arguments.out) if arguments.out else get_dataset_path()
+    root = get_dataset_path() if arguments.out is None else user_path(arguments.out)
     run = load_run(folder.path, "c", arguments.policy or BEST)
-    check_task(run)
+    check_task(run.task)
     path = root / dataset_id(run)
     check_absent(path)
     parsing.check_writable(path)

@@ -15,7 +15,7 @@ LAYERS = tomllib.loads((CLONE / "pyproject.toml").read_text())["tool"]["importli
 IMPORT_ALL = """
 import contextlib, gc, importlib, os, pkgutil, warnings
 import gymnasium, jax, onnx, tensorboardX, wandb  # some of these set variables
-OPTIONAL = ("torch", "stable_baselines3", "tensordict", "rsl_rl")
+OPTIONAL = ("h5py", "minari", "torch", "stable_baselines3", "tensordict", "rsl_rl")
 for name in OPTIONAL:
     with contextlib.suppress(ModuleNotFoundError):
         importlib.import_module(name)

@@ -61,6 +61,7 @@ RUN_BY_OTHER_TESTS = {
     "my_reward.py": "test_own_reward",
     "heavy_torso.py": "test_own_body",
     "without_jax.py": "interop/test_onnx.py",
+    "read_dataset.py": "interop/test_minari.py",
     "huber_a2c.py": "test_examples.py",
 }
 
@@ -236,6 +237,9 @@ def test_every_command(line, small_run, tmp_path, monkeypatch, capfd):
     elif name == "train" and not {"--cfg", "--help"} & {*arguments}:
         arguments += [*sizes(arguments), "total_steps=1", "evaluation.gymnasium_episodes=1"]
     elif "robustness=true" in arguments:
+        arguments += ["episodes=1"]
+    elif "format=minari" in arguments:
+        pytest.importorskip("minari")
         arguments += ["episodes=1"]
     elif name == "play":
         arguments += ["width=96", "height=64"]

@@ -39,6 +39,13 @@ class RecordedEpisode:
     infos: dict[str, np.ndarray]
     """`[T+1, …] f64` each. The first row is NaN for entries that the reset's `info` does not have."""
 
+    @property
+    def num_bytes(self) -> int:
+        """Size of its arrays."""
+        flags = self.terminations.nbytes + self.truncations.nbytes
+        numbers = (self.observations, self.actions, self.rewards, *self.infos.values())
+        return flags + sum(array.nbytes for array in numbers)
+
 
 def record_episodes(task: Task, act: Act, seeds: list[int]) -> Iterator[RecordedEpisode]:
     """Play one episode per seed, without changes of the physics, and yield them in this order.

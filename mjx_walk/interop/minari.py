@@ -3,6 +3,9 @@
 import contextlib
 import copy
 import dataclasses
+import errno
+import os
+import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -30,6 +33,8 @@ from mjx_walk.viewing.episode import make_gymnasium
 __all__ = ["check_absent", "check_task", "dataset_id", "write_dataset"]
 
 _NAMESPACE = "mjx_walk"
+_RESERVE = 16 * 2**20
+"""Bytes of the disk that stay free. HDF5 crashes on a full disk, instead of raising an error."""
 _REQUIREMENTS = ("mujoco", "gymnasium")
 """Packages whose versions the episodes depend on. Minari warns if another version is installed."""
 
@@ -54,20 +59,19 @@ def check_absent(path: Path) -> None:
         raise UserError(f"{path} exists already; choose another out=, or remove it")
 
 
-def check_task(saved: SavedPolicy) -> None:
+def check_task(task: Task) -> None:
     """Check that a dataset can name the environment, so that Minari makes it again anywhere.
 
     Raises:
-        UserError: Gymnasium does not have the task, or its model is the user's own file.
+        UserError: Gymnasium does not have the task, or only with another floor or model.
     """
-    task = saved.task
-    if not task.is_in_gymnasium:
-        raise UserError(f"Gymnasium has no {task.gymnasium_id}, whose episodes Minari would replay; choose format=onnx")
     xml_file = task.options.xml_file
+    if not task.is_in_gymnasium:
+        raise UserError(f"Minari replays episodes in Gymnasium, which has no {task.gymnasium_id}; choose format=onnx")
+    if task.ground.is_on:
+        raise UserError("Minari replays episodes in Gymnasium, whose floor has no hills; choose format=onnx")
     if xml_file and not is_asset(xml_file):
-        raise UserError(
-            f"a dataset cannot hold the model {xml_file}, with which Minari would replay; choose format=onnx"
-        )
+        raise UserError(f"Minari replays episodes in Gymnasium, without your model {xml_file}; choose format=onnx")
 
 
 def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int) -> Scores:
@@ -77,7 +81,7 @@ def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int) 
 
     Args:
         root: folder of datasets, as in `MINARI_DATASETS_PATH`.
-        saved: the policy, which `check_task` allows.
+        saved: the policy, whose task `check_task` allows.
         num_episodes: N.
         seed: episode i is reset with `seed + i`.
 
@@ -111,7 +115,7 @@ def _write(folder: Path, saved: SavedPolicy, seeds: list[int]) -> Scores:
         storage = MinariStorage.new(folder, env.observation_space, env.action_space, _portable_spec(env, saved.task))
     rewards: list[np.ndarray] = []
     with contextlib.closing(record_episodes(saved.task, saved.act, seeds)) as episodes:
-        storage.update_episodes(_buffers(episodes, rewards))
+        storage.update_episodes(_buffers(episodes, rewards, folder))
     storage.update_episode_metadata(map(EpisodeMetadataCallback(), ({"rewards": own} for own in rewards)))
     returns, lengths = np.array([own.sum() for own in rewards]), np.array([len(own) for own in rewards])
     scores = Scores(returns, lengths, seeds, saved.task.gymnasium_id)
@@ -128,9 +132,11 @@ def _portable_spec(env: gymnasium.Env, task: Task) -> EnvSpec:
     return spec
 
 
-def _buffers(episodes: Iterable[RecordedEpisode], rewards: list[np.ndarray]) -> Iterator[EpisodeBuffer]:
-    """Episodes as Minari takes them. Their rewards are appended to a list."""
+def _buffers(episodes: Iterable[RecordedEpisode], rewards: list[np.ndarray], folder: Path) -> Iterator[EpisodeBuffer]:
+    """Episodes as Minari takes them, while the disk has space for them. Their rewards are appended to a list."""
     for episode in episodes:
+        if shutil.disk_usage(folder).free < 2 * episode.num_bytes + _RESERVE:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder.parents[1]))
         rewards.append(episode.rewards)
         yield EpisodeBuffer(**{field.name: getattr(episode, field.name) for field in dataclasses.fields(episode)})
 
