@@ -88,9 +88,15 @@ class ParallelEpisodes:
         return self._receive_steps()
 
     def _receive_steps(self) -> Steps:
-        *columns, infos = zip(*(_receive(worker) for worker in self._workers), strict=True)
-        stacked = {name: np.concatenate([info[name] for info in infos]) for name in infos[0]}
-        return Steps(*(np.concatenate(column) for column in columns), stacked)
+        received = [_receive(worker) for worker in self._workers]
+        obs, rewards, terminated, truncated, infos = zip(*received, strict=True)
+        return Steps(
+            np.concatenate(obs),
+            np.concatenate(rewards),
+            np.concatenate(terminated),
+            np.concatenate(truncated),
+            {name: np.concatenate([info[name] for info in infos]) for name in infos[0]},
+        )
 
 
 def warn_of_differences(task: Task) -> None:

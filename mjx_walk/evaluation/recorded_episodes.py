@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -47,7 +47,7 @@ class RecordedEpisode:
         return flags + sum(array.nbytes for array in numbers)
 
 
-def record_episodes(task: Task, act: Act, seeds: list[int]) -> Iterator[RecordedEpisode]:
+def record_episodes(task: Task, act: Act, seeds: list[int]) -> Generator[RecordedEpisode, None, None]:
     """Play one episode per seed, without changes of the physics, and yield them in this order.
 
     As many as fit into half a gigabyte of memory are played side by side. Close the iterator to stop early.

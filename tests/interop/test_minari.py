@@ -146,10 +146,6 @@ def test_mistakes_print_one_line_and_leave_nothing(datasets, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
     for arguments, message in (
-        (("dtype=float32",), "dtype=float32 has no effect with format=minari"),
-        (("format=onnx", "episodes=3"), "episodes=3 has no effect with format=onnx"),
-        (("format=onnx", "seed=3"), "seed=3 has no effect with format=onnx"),
-        (("episodes=0",), "episodes=0: must be at least 1"),
         (("out=",), "a path is empty"),
         (("out=file",), "file is a file; choose another path"),
         ((f"out={datasets}",), f"{datasets}/{REACHER} exists already; choose another out=, or remove it"),
