@@ -96,7 +96,7 @@ def _play_round(
 
 def _cut_out(i: int, seed: int, steps: list[Steps], actions: list[np.ndarray]) -> RecordedEpisode:
     """Episode i of a round, from its reset to its last step."""
-    infos = {name: np.stack([values[i], *(s.infos[name][i] for s in steps[1:])]) for name, values in _starts(steps)}
+    starts = {name: np.full_like(values, np.nan) for name, values in steps[1].infos.items()} | steps[0].infos
     return RecordedEpisode(
         seed=seed,
         observations=np.stack([s.obs[i] for s in steps]),
@@ -104,11 +104,5 @@ def _cut_out(i: int, seed: int, steps: list[Steps], actions: list[np.ndarray]) -
         rewards=np.array([s.rewards[i] for s in steps[1:]]),
         terminations=np.array([s.terminated[i] for s in steps[1:]]),
         truncations=np.array([s.truncated[i] for s in steps[1:]]),
-        infos=infos,
+        infos={name: np.stack([starts[name][i], *(s.infos[name][i] for s in steps[1:])]) for name in steps[1].infos},
     )
-
-
-def _starts(steps: list[Steps]) -> Iterator[tuple[str, np.ndarray]]:
-    """Entries of the first step's `info`, with their values at the reset, or NaN."""
-    for name, values in steps[1].infos.items():
-        yield name, steps[0].infos.get(name, np.full_like(values, np.nan))

@@ -23,6 +23,7 @@ from mjx_walk.envs import Task
 from mjx_walk.envs.model_files import is_asset
 from mjx_walk.evaluation.recorded_episodes import RecordedEpisode, record_episodes
 from mjx_walk.evaluation.saved_policies import SavedPolicy
+from mjx_walk.machine.signals import as_by_ctrl_c
 from mjx_walk.storage.files import write_text
 from mjx_walk.storage.folders import replacing_folder
 from mjx_walk.storage.scores import Scores
@@ -97,7 +98,7 @@ def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int) 
     namespaces = (path.parent, path.parent.parent)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with replacing_folder(path) as folder:
+        with as_by_ctrl_c(), replacing_folder(path) as folder:
             scores = _write(folder / "data", saved, [seed + i for i in range(num_episodes)])
         for namespace in namespaces:
             if not (namespace / NAMESPACE_METADATA_FILENAME).exists():

@@ -38,7 +38,8 @@ def datasets(tmp_path_factory):
     edit_config(run, "  max_episode_steps: 3\n", "  max_episode_steps: 1000\n")
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(recorded_episodes, "MAX_PARALLEL_EPISODES", 2)
-        assert export(f"run={run}", "policy=final", "episodes=3", f"out={folder}") == 0
+        patched.setenv("MINARI_DATASETS_PATH", str(folder))
+        assert export(f"run={run}", "policy=final", "episodes=3") == 0
     return folder
 
 
