@@ -1,4 +1,4 @@
-"""`python -m mjx_walk.export run=RUN_DIR`: export a policy as ONNX, or its episodes as a dataset of Minari."""
+"""`python -m mjx_walk.export run=RUN_DIR`: export a policy to ONNX or PyTorch, or its episodes to Minari."""
 
 import dataclasses
 import json
@@ -27,6 +27,7 @@ usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [forma
                                  [out=FILE.onnx]
        python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=minari [episodes=1000] [seed=0]
                                  [out=FOLDER]
+       python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=torch [out=FOLDER]
 
   policy=best     the policy with the highest evaluation during training, the default
   policy=final    the newest policy, which eval scores by default
@@ -43,6 +44,10 @@ format=minari, a dataset of the policy's episodes in the real Gymnasium, without
   seed=N          episode i is reset with N + i
   out=FOLDER      of datasets, by default Minari's own: $MINARI_DATASETS_PATH or ~/.minari/datasets. The dataset has a
                   folder of its own below it. An existing dataset is not overwritten.
+
+format=torch, the policy for PyTorch:
+  out=FOLDER      of two files, by default RUN_DIR/policy.torch, or NAME.torch in the current folder for a policy of the
+                  zoo. policy.safetensors holds the arrays. policy.py, which you can edit, builds the network.
 """
 
 
@@ -50,7 +55,7 @@ format=minari, a dataset of the policy's episodes in the real Gymnasium, without
 class Arguments:
     run: str | None = None
     policy: str | None = setting(None, choices=POLICIES)
-    format: str = setting("onnx", choices=("onnx", "minari"))
+    format: str = setting("onnx", choices=("onnx", "minari", "torch"))
     dtype: str = setting("float64", choices=("float64", "float32"), only_if={"format": "onnx"})
     episodes: int = setting(1000, at_least=1, only_if={"format": "minari"})
     seed: int = setting(0, at_least=0, at_most=MAX_SEED, only_if={"format": "minari"})
@@ -64,7 +69,7 @@ def main(command_line: list[str]) -> None:
     refuse_ineffective(arguments, [argument.partition("=")[0] for argument in own])
     parsing.stay_on_cpu()
     folder = zoo.open_run(arguments.run)
-    run = _export_minari(arguments, folder) if arguments.format == "minari" else _export_onnx(arguments, folder)
+    run = {"minari": _export_minari, "onnx": _export_onnx, "torch": _export_torch}[arguments.format](arguments, folder)
     if arguments.policy is None and len(kept_policies(folder)) > 1:
         print(choice_line(run.policy_name))
 
@@ -111,6 +116,22 @@ def _export_minari(arguments: Arguments, folder: RunFolder) -> Run:
     print(f"{scores}", "Load it in a shell and in Python:", sep="\n")
     print(f"  export MINARI_DATASETS_PATH={shlex.quote(str(root.absolute()))}")
     print(f'  dataset = minari.load_dataset("{dataset_id(run)}")')
+    return run
+
+
+def _export_torch(arguments: Arguments, folder: RunFolder) -> Run:
+    """Write the policy for PyTorch, and say how to load it."""
+    try:
+        from mjx_walk.interop.torch_policy import MODULE, WEIGHTS, write_policy
+    except ImportError as error:
+        raise UserError("format=torch needs safetensors: pip install safetensors") from error
+    path = user_path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.torch")
+    for name in (WEIGHTS, MODULE):
+        parsing.check_writable(path / name)
+    run = load_run(folder.path, "c", arguments.policy or BEST)
+    write_policy(path, run, _metadata(run))
+    print(f"{path}: the {run.policy_name} policy (step {run.policy_metadata['env_steps']:,}). In this folder:")
+    print(f'  from policy import Policy; policy = Policy("{WEIGHTS}")')
     return run
 
 

@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.training.networks import ACTIVATION
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.evaluation.saved_policies import SavedPolicy
+from mjx_walk.storage.files import replacing
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["MODULE", "WEIGHTS", "write_policy"]
@@ -48,9 +49,11 @@ def write_policy(folder: Path, run: SavedPolicy, metadata: Mapping[str, str]) ->
     """
     arrays, facts = _arrays(run), _facts(run)
     _check(run, arrays, facts)
-    save_file(arrays, folder / WEIGHTS, {**metadata, "network": json.dumps(facts)})
     module = Path(__file__).with_name("torch_loader.py")
-    (folder / MODULE).write_text(module.read_text(encoding="utf-8"), encoding="utf-8")
+    with replacing(folder / WEIGHTS) as new:
+        new.write_bytes(save(arrays, {**metadata, "network": json.dumps(facts)}))
+    with replacing(folder / MODULE) as new:
+        new.write_bytes(module.read_bytes())
 
 
 def _facts(run: SavedPolicy) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, train_here
+from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command_here, train_here
 from safetensors import safe_open
 
 import mjx_walk
@@ -33,11 +33,11 @@ def assert_equal_actions(run, folder):
 @pytest.mark.slow
 @needs_torch
 @pytest.mark.parametrize("name", ["humanoid-csac", "pusher-csac", "walker2d-ppo"])
-def test_modules_act_as_policies_of_the_zoo(name, tmp_path):
-    run = mjx_walk.load_run(f"zoo:{name}", physics="c")
-    write_policy(tmp_path, run, {})
-    assert_equal_actions(run, tmp_path)
-    assert len((tmp_path / MODULE).read_text().splitlines()) < 40
+def test_modules_act_as_policies_of_the_zoo(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert command_here("export", f"run=zoo:{name}", "format=torch") == 0
+    assert capsys.readouterr().out.startswith(f"{name}.torch: the best policy (step ")
+    assert_equal_actions(mjx_walk.load_run(f"zoo:{name}", physics="c"), tmp_path / f"{name}.torch")
 
 
 @pytest.mark.slow
@@ -59,11 +59,12 @@ def test_modules_act_as_other_networks(settings, tmp_path):
 
 
 def test_files_describe_the_policy(tmp_path):
-    run = mjx_walk.load_run("zoo:hopper-csac", physics="c")
-    write_policy(tmp_path, run, {"task": "Hopper-v5"})
+    assert command_here("export", "run=zoo:hopper-csac", "format=torch", f"out={tmp_path}") == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == [MODULE, WEIGHTS]
     with safe_open(tmp_path / WEIGHTS, "numpy") as file:
         metadata, names = file.metadata(), {*file.keys()}
     assert metadata["task"] == "Hopper-v5" and json.loads(metadata["network"])["sizes"] == [11, 512, 512, 3]
+    assert json.loads(metadata["seconds_per_step"]) == 0.008
     assert {"mean", "std", "low", "high", "network.0.weight", "network.4.bias"} < names
 
 
