@@ -85,14 +85,13 @@ def _of_one_seed(row: dict[str, str]) -> Best:
 
 
 def summary() -> str:
-    """The table of README: scores, times, and the highest published scores."""
+    """The table of README: scores and times."""
     rows = []
     for best in best_recipes():
         cells = [best.task, best.algorithm, number(best.score), number(best.std_over_seeds), best.seeds]
-        others = [_published(best.task, version, seeds) for version, seeds in _OTHERS]
-        rows.append([*cells, best.million_steps, f"{float(best.seconds) / 60:.1f}", *others, code(best.command)])
-    titles = ("Task", "Algorithm", ">Score", ">Std", ">Seeds", ">Steps (M)", ">Minutes")
-    return table((*titles, ">Highest mean (v5)", ">Highest single run (v5)", ">Highest mean (v4)", "Command"), rows)
+        rows.append([*cells, best.million_steps, f"{float(best.seconds) / 60:.1f}", code(best.command)])
+    titles = ("Task", "Algorithm", ">Score", ">Std", ">Seeds", ">Steps (M)", ">Minutes", "Command")
+    return table(titles, rows)
 
 
 def detailed() -> str:
@@ -122,8 +121,3 @@ def comparison() -> str:
 
 _OTHERS = (("v5", True), ("v5", False), ("v4", True))
 """Published scores to show: the version, and whether they are means over several seeds."""
-
-
-def _published(task: str, version: str, several_seeds: bool) -> str:
-    row = highest_published(task.replace("v5", version), several_seeds)
-    return number(row["score"]) if row else _DASH
