@@ -1,6 +1,7 @@
-"""`python -m mjx_walk.export run=RUN_DIR`: export a policy to ONNX or PyTorch, or its episodes to Minari."""
+"""`python -m mjx_walk.export run=RUN_DIR`: export a policy for other programs, its episodes, or a folder to share."""
 
 import dataclasses
+import importlib.util
 import json
 import shlex
 from pathlib import Path
@@ -12,13 +13,17 @@ from mjx_walk.api import Run, load_run
 from mjx_walk.cli import parsing
 from mjx_walk.envs.motors import joint_of
 from mjx_walk.evaluation.saved_policies import kept_policies
+from mjx_walk.interop import hub_folder
 from mjx_walk.settings.own_tasks import take_task
 from mjx_walk.storage.files import replacing, user_path
+from mjx_walk.storage.folders import replacing_folder
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import BEST, POLICIES
 from mjx_walk.training.messages import choice_line
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import MAX_SEED, refuse_ineffective, setting
+from mjx_walk.viewing.episode import record_episode
+from mjx_walk.viewing.rendering import choose_opengl, write_film
 
 __all__ = ["USAGE", "Arguments", "main"]
 
@@ -28,6 +33,7 @@ usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [forma
        python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=minari [episodes=1000] [seed=0]
                                  [out=FOLDER]
        python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=torch [out=FOLDER]
+       python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=hub [out=FOLDER]
 
   policy=best     the policy with the highest evaluation during training, the default
   policy=final    the newest policy, which eval scores by default
@@ -48,6 +54,11 @@ format=minari, a dataset of the policy's episodes in the real Gymnasium, without
 format=torch, the policy for PyTorch:
   out=FOLDER      of two files, by default RUN_DIR/policy.torch, or NAME.torch in the current folder for a policy of the
                   zoo. policy.safetensors holds the arrays. policy.py, which you can edit, builds the network.
+
+format=hub, a folder to share, as on the Hugging Face Hub:
+  out=FOLDER      by default RUN_DIR/policy.hub, or NAME.hub in the current folder for a policy of the zoo. It holds a
+                  model card, the policy, its score, its ONNX file, and a film where this machine can render. Commands
+                  take it as run=FOLDER. An existing folder is not overwritten.
 """
 
 
@@ -55,7 +66,7 @@ format=torch, the policy for PyTorch:
 class Arguments:
     run: str | None = None
     policy: str | None = setting(None, choices=POLICIES)
-    format: str = setting("onnx", choices=("onnx", "minari", "torch"))
+    format: str = setting("onnx", choices=("onnx", "minari", "torch", "hub"))
     dtype: str = setting("float64", choices=("float64", "float32"), only_if={"format": "onnx"})
     episodes: int = setting(1000, at_least=1, only_if={"format": "minari"})
     seed: int = setting(0, at_least=0, at_most=MAX_SEED, only_if={"format": "minari"})
@@ -69,31 +80,39 @@ def main(command_line: list[str]) -> None:
     refuse_ineffective(arguments, [argument.partition("=")[0] for argument in own])
     parsing.stay_on_cpu()
     folder = zoo.open_run(arguments.run)
-    run = {"minari": _export_minari, "onnx": _export_onnx, "torch": _export_torch}[arguments.format](arguments, folder)
+    run = _EXPORTS[arguments.format](arguments, folder)
     if arguments.policy is None and len(kept_policies(folder)) > 1:
         print(choice_line(run.policy_name))
 
 
 def _export_onnx(arguments: Arguments, folder: RunFolder) -> Run:
     """Write the policy as ONNX, and say where it is."""
-    try:
-        import onnx
-
-        from mjx_walk.interop.onnx import translate
-    except ImportError as error:
-        raise UserError("format=onnx needs ONNX: pip install onnx") from error
+    _require_onnx(arguments.format)
     path = user_path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.onnx")
     parsing.check_suffix(path, ".onnx")
     parsing.check_writable(path)
     run = load_run(folder.path, "c", arguments.policy or BEST)
-    name = f"{run.config.env.name}_{run.config.algo.name}"
-    model = translate(run.act, run.task.observation_size, name, arguments.dtype)
-    onnx.helper.set_model_props(model, _metadata(run))
-    with replacing(path) as new:
-        onnx.save(model, str(new))
+    _write_onnx(path, run, arguments.dtype)
     print(f"{path}: observation [N, {run.task.observation_size}] → action [N, {run.task.action_size}]")
     print(f"It holds the {run.policy_name} policy (step {run.policy_metadata['env_steps']:,}).")
     return run
+
+
+def _require_onnx(file_format: str) -> None:
+    if importlib.util.find_spec("onnx") is None:
+        raise UserError(f"format={file_format} needs ONNX: pip install onnx")
+
+
+def _write_onnx(path: Path, run: Run, dtype: str) -> None:
+    import onnx
+
+    from mjx_walk.interop.onnx import translate
+
+    name = f"{run.config.env.name}_{run.config.algo.name}"
+    model = translate(run.act, run.task.observation_size, name, dtype)
+    onnx.helper.set_model_props(model, _metadata(run))
+    with replacing(path) as new:
+        onnx.save(model, str(new))
 
 
 def _export_minari(arguments: Arguments, folder: RunFolder) -> Run:
@@ -133,6 +152,40 @@ def _export_torch(arguments: Arguments, folder: RunFolder) -> Run:
     print(f"{path}: the {run.policy_name} policy (step {run.policy_metadata['env_steps']:,}). In this folder:")
     print(f'  from policy import Policy; policy = Policy("{WEIGHTS}")')
     return run
+
+
+def _export_hub(arguments: Arguments, folder: RunFolder) -> Run:
+    """Write a folder to share, and say how to use it."""
+    _require_onnx(arguments.format)
+    path = user_path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.hub")
+    if path.exists():
+        raise UserError(f"{path} exists already; choose another out=, or remove it")
+    parsing.check_writable(path)
+    run = load_run(folder.path, "c", arguments.policy or BEST)
+    hub_folder.check_shareable(run)
+    scores = run.evaluate()
+    with replacing_folder(path) as new:
+        hub_folder.write_run(new, run, scores)
+        _write_onnx(new / hub_folder.ONNX, run, "float64")
+        hub_folder.write_card(new / hub_folder.CARD, path.name, run, scores, _film(run, new / hub_folder.FILM))
+    print(f"{path}: {scores}")
+    print(f"To share it: hf upload YOUR_NAME/{path.stem} {shlex.quote(str(path))}")
+    return run
+
+
+def _film(run: Run, path: Path) -> bool:
+    """Write a film of an episode. Returns whether this machine can render one."""
+    try:
+        choose_opengl()
+    except UserError as error:
+        print(f"without a film: {error}")
+        return False
+    episode = record_episode(run.task, run.policy, 0, (640, 480))
+    write_film(episode.frames, path, episode.frames_per_second)
+    return True
+
+
+_EXPORTS = {"minari": _export_minari, "onnx": _export_onnx, "torch": _export_torch, "hub": _export_hub}
 
 
 def _metadata(run: Run) -> dict[str, str]:
