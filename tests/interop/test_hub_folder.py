@@ -64,6 +64,6 @@ def test_what_others_lack_is_refused(tmp_path):
     robot.write_text(small_robot())
     run.task = mjx_walk.make_env("locomotion", "c", xml_file=str(robot))
     with pytest.raises(
-        UserError, match="^format=hub shares policies of Gymnasium's tasks, and others lack .*robot.xml;"
+        UserError, match=r"^format=hub shares policies of Gymnasium's tasks, and others lack .*robot.xml;"
     ):
         check_shareable(run)
