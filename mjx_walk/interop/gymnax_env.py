@@ -18,7 +18,7 @@ from mjx_walk.machine.compat import standard_dtypes
 __all__ = ["Box", "EnvParams", "GymnaxEnv"]
 
 _ENVS_PER_RESET = 16
-"""Share of a batch that is reset at once: one environment in 16. Episodes of an untrained walker last 20 steps."""
+"""One environment in this many is reset at once. Episodes of an untrained walker last about 20 steps."""
 
 Info = dict[str, Array]
 Step = tuple[Array, State, Array, Array, Info]
@@ -182,4 +182,4 @@ class GymnaxEnv:
 
 def _common_value(values: np.ndarray) -> float | np.ndarray:
     """The value of all elements, or the array if they differ."""
-    return float(values[0]) if values.size and (values == values[0]).all() else np.float32(values)
+    return float(values[0]) if values.size and (values == values[0]).all() else values.astype(np.float32)

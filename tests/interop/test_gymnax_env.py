@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import blocks
 
 from mjx_walk.envs import make_env
 from mjx_walk.interop.gymnax_env import EnvParams, GymnaxEnv
@@ -81,7 +82,8 @@ def test_one_environment_and_nested_batches_agree(make_key):
     nested = jax.random.split(make_key(4), (2, 3))
     _, state = jax.vmap(jax.vmap(env.reset))(nested)
     action = jnp.full((2, 3, 6), 0.1)
-    obs = jax.vmap(jax.vmap(env.step, in_axes=(0, 0, 0, None)), in_axes=(0, 0, 0, None))(nested, state, action, params)[0]
+    step = functools.partial(env.step, params=params)
+    obs, *_ = jax.vmap(jax.vmap(step))(nested, state, action)
     one = env.step(nested[1, 2], jax.tree.map(lambda x: x[1, 2], state), action[1, 2], params)
     fresh, _ = env.reset(jax.random.split(nested[1, 2])[1])
     assert one[3]
@@ -143,10 +145,8 @@ def test_actions_of_other_shapes():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_rejaxs_ppo_learns_to_balance():
-    rejax = pytest.importorskip("rejax", reason="CONTRIBUTING.md says how to install it")
-    env = GymnaxEnv("inverted_pendulum", "c")
-    sizes = {"num_envs": 16, "num_steps": 64, "num_minibatches": 8, "total_timesteps": 8192, "eval_freq": 8192}
-    algorithm = rejax.PPO.create(env=env, learning_rate=1e-3, **sizes)
-    _, (_, returns) = jax.jit(algorithm.train)(jax.random.PRNGKey(0))
-    before, after = np.asarray(returns).mean(-1)
-    assert after > 5 * before
+    pytest.importorskip("rejax", reason="docs/adapters.md says how to install it")
+    (example,) = [block for block in blocks("python") if block.startswith("# in_rejax.py")]
+    exec(example, names := {})
+    first, _, last = np.asarray(names["returns"]).mean(axis=1)
+    assert last > 10 * first
