@@ -12,6 +12,7 @@ from mjx_walk.utils.versions import __version__
 
 __all__ = [
     "BraxEnv",
+    "GymnaxEnv",
     "__version__",
     "load_run",
     "make_env",
@@ -29,11 +30,13 @@ if TYPE_CHECKING:
     from mjx_walk.api import load_run, run
     from mjx_walk.envs import make_env, register_task
     from mjx_walk.interop.brax_env import BraxEnv
+    from mjx_walk.interop.gymnax_env import GymnaxEnv
     from mjx_walk.interop.trainer_envs import make_rsl_rl_env, make_sb3_env, make_torch_env
     from mjx_walk.machine.compat import prepare_jax
 
 _WHERE = {
     "BraxEnv": "mjx_walk.interop.brax_env",
+    "GymnaxEnv": "mjx_walk.interop.gymnax_env",
     "load_run": "mjx_walk.api",
     "make_env": "mjx_walk.envs",
     "make_rsl_rl_env": "mjx_walk.interop.trainer_envs",

@@ -33,7 +33,9 @@ LISTS = {
     "envs_with_contact_cost": ", ".join(n for n, (_, c) in TASKS.items() if hasattr(c, "contact_cost_weight")),
     "policies": ", ".join(zoo.names()),
 }
-NAMES = {name: getattr(mjx_walk, name) for name in ("BraxEnv", "load_run", "make_env", "register_task", "run")}
+NAMES = {
+    name: getattr(mjx_walk, name) for name in ("BraxEnv", "GymnaxEnv", "load_run", "make_env", "register_task", "run")
+}
 
 
 def read(table):

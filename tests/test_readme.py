@@ -45,6 +45,7 @@ PROGRAMS = {
     "from_python.py": r"\(16, 348\)",
     "in_gymnasium.py": "",
     "in_brax.py": "",
+    "in_gymnax.py": "",
     "with_another_id.py": "",
     "read_data.py": r"\[.* 0\.\d+\] \d+",
     "train_sb3.py": "",
@@ -62,6 +63,7 @@ RUN_BY_OTHER_TESTS = {
     "heavy_torso.py": "test_own_body",
     "without_jax.py": "interop/test_onnx.py",
     "read_dataset.py": "interop/test_minari.py",
+    "in_rejax.py": "interop/test_gymnax_env.py",
     "huber_a2c.py": "test_examples.py",
 }
 
