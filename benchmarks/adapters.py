@@ -2,11 +2,13 @@
 
 import argparse
 import csv
+import functools
 import importlib.util
 import statistics
 import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +25,9 @@ Step environments as training does, and through each adapter whose package is in
 Print CSV: steps per second, and their ratio to training's speed in the same round. Both are medians over rounds.
 """
 BARE = "training's environment"
-ADAPTERS = {"make_torch_env": "torch", "make_sb3_env": "stable_baselines3", "make_rsl_rl_env": "rsl_rl"}
-"""Functions that make an environment, and the package that each needs."""
 _STEPS_PER_POOL = 32
 """Steps after which training draws new random starts."""
+_STEPS_PER_WAIT = 16
 
 
 class Bare:
@@ -44,6 +45,9 @@ class Bare:
         state, _, outcome, _ = self._env.step(state, actions, nobody, actions[:0])
         return state, outcome
 
+    def prepared(self, actions: np.ndarray) -> list[jax.Array]:
+        return [jnp.asarray(some) for some in actions]
+
     def step(self, actions: jax.Array) -> jax.Array:
         if self._count % _STEPS_PER_POOL == 0:
             self._state = self._renew(self._state, jax.random.PRNGKey(self._count))
@@ -52,57 +56,78 @@ class Bare:
         return outcome.reward
 
 
+class Adapter:
+    """An environment for another trainer, with actions as that trainer has them."""
+
+    def __init__(self, env: Any, to_actions: Callable[[np.ndarray], Any]):
+        self._env, self._to_actions = env, to_actions
+
+    def prepared(self, actions: np.ndarray) -> list[Any]:
+        return [self._to_actions(some) for some in actions]
+
+    def step(self, actions: Any) -> Any:
+        return self._env.step(actions)[1]
+
+
+def _torch(env: str, num_envs: int, physics: str) -> Adapter:
+    import torch
+
+    made = mjx_walk.make_torch_env(env, num_envs, physics=physics)
+    made.reset(seed=0)
+    return Adapter(made, functools.partial(torch.tensor, device=made.device))
+
+
+def _rsl_rl(env: str, num_envs: int, physics: str) -> Adapter:
+    import torch
+
+    made = mjx_walk.make_rsl_rl_env(env, num_envs, physics=physics, seed=0)
+    return Adapter(made, functools.partial(torch.tensor, device=made.device))
+
+
+def _sb3(env: str, num_envs: int, physics: str) -> Adapter:
+    made = mjx_walk.make_sb3_env(env, num_envs, physics=physics)
+    made.reset()
+    return Adapter(made, np.array)
+
+
+ADAPTERS = {
+    "PyTorch": ("torch", _torch),
+    "rsl_rl": ("rsl_rl", _rsl_rl),
+    "Stable-Baselines3": ("stable_baselines3", _sb3),
+}
+"""For each adapter, the package that it needs and a function that makes it."""
+
+
 def measure(env: str, num_envs: int, physics: str, seconds: float, rounds: int) -> dict[str, list[float]]:
     """Steps per second of each round, by the name of the environment."""
     task = mjx_walk.make_env(env, physics)
     low, high = np.asarray(task.action_low), np.asarray(task.action_high)
     actions = np.random.default_rng(0).uniform(low, high, (64, num_envs, task.action_size)).astype(np.float32)
-    steps = {BARE: _stepper(Bare(task, num_envs).step, [jnp.asarray(some) for some in actions])}
-    for name, package in ADAPTERS.items():
+    envs: dict[str, Bare | Adapter] = {BARE: Bare(task, num_envs)}
+    for name, (package, make) in ADAPTERS.items():
         if importlib.util.find_spec(package):
-            steps[name] = _adapter(name, env, num_envs, physics, actions)
-    speeds: dict[str, list[float]] = {name: [] for name in steps}
-    for step in steps.values():
-        _time(step, 0.0)
+            envs[name] = make(env, num_envs, physics)
+    given = {name: one.prepared(actions) for name, one in envs.items()}
+    speeds: dict[str, list[float]] = {name: [] for name in envs}
+    for name, one in envs.items():
+        _speed(one, given[name], 0.0)
     for _ in range(rounds):
-        for name, step in steps.items():
-            count, duration = _time(step, seconds)
-            speeds[name].append(count * num_envs / duration)
+        for name, one in envs.items():
+            speeds[name].append(num_envs * _speed(one, given[name], seconds))
     return speeds
 
 
-def _adapter(name: str, env: str, num_envs: int, physics: str, actions: np.ndarray) -> Callable[[int], None]:
-    made = getattr(mjx_walk, name)(env, num_envs, physics=physics)
-    if name != "make_rsl_rl_env":
-        made.reset()
-    if name == "make_sb3_env":
-        return _stepper(made.step, list(actions))
-    import torch
-
-    return _stepper(made.step, [torch.from_numpy(some).to(made.device) for some in actions])
-
-
-def _stepper(step: Callable, actions: list) -> Callable[[int], None]:
-    """A function that makes some steps and waits for the last one's rewards."""
-
-    def run(count: int) -> None:
-        for i in range(count):
-            result = step(actions[i % len(actions)])
-        rewards = result[1] if isinstance(result, tuple) else result
-        float(rewards.sum())
-
-    return run
-
-
-def _time(run: Callable[[int], None], seconds: float) -> tuple[int, float]:
-    """Steps made in at least `seconds`, and how long they took."""
+def _speed(env: Bare | Adapter, actions: list[Any], seconds: float) -> float:
+    """Steps per second over at least that long, until the last rewards are there."""
     count, start = 0, time.perf_counter()
     while True:
-        run(16)
-        count += 16
+        for _ in range(_STEPS_PER_WAIT):
+            rewards = env.step(actions[count % len(actions)])
+            count += 1
+        float(rewards.sum())
         duration = time.perf_counter() - start
         if duration >= seconds:
-            return count, duration
+            return count / duration
 
 
 def main() -> None:

@@ -53,7 +53,7 @@ format=minari, a dataset of the policy's episodes in the real Gymnasium, without
 
 format=torch, the policy for PyTorch:
   out=FOLDER      of two files, by default RUN_DIR/policy.torch, or NAME.torch in the current folder for a policy of the
-                  zoo. policy.safetensors holds the arrays. policy.py, which you can edit, builds the network.
+                  zoo. policy.safetensors holds the arrays. policy.py builds the network.
 
 format=hub, a folder to share, as on the Hugging Face Hub:
   out=FOLDER      by default RUN_DIR/policy.hub, or NAME.hub in the current folder for a policy of the zoo. It holds a

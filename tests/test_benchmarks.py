@@ -49,7 +49,7 @@ def test_environments_for_other_trainers_are_measured(monkeypatch, capsys):
     runpy.run_path(str(CLONE / "benchmarks" / "adapters.py"), run_name="__main__")
     header, *rows = (line.split(",") for line in capsys.readouterr().out.splitlines())
     assert header == ["Environment", "Steps/s", "Ratio"] and rows[0][0] == "training's environment"
-    assert {"make_torch_env", "make_sb3_env"} <= {row[0] for row in rows}
+    assert {"PyTorch", "Stable-Baselines3"} <= {row[0] for row in rows}
     assert rows[0][2] == "1.000" and all(int(row[1]) > 0 and float(row[2]) > 0 for row in rows)
 
 

@@ -45,7 +45,6 @@ for iteration in range(iterations):
             later = advantage[t] = delta[t] + gamma * lam * ~over_[t] * later
         target = advantage + value_
         data = [x.flatten(0, 1) for x in (obs_, action_, log_prob_, advantage, target)]
-        policy[0].train()(data[0]), critic[0].train()(data[0]), policy.eval(), critic.eval()
     optimizer.param_groups[0]["lr"] = 3e-4 * (1 - iteration / iterations)
     for _ in range(epochs):
         for rows in torch.randperm(len(target.flatten()), device=env.device).chunk(minibatches):
@@ -58,6 +57,9 @@ for iteration in range(iterations):
             loss.backward()
             nn.utils.clip_grad_norm_(parameters, 0.5)
             optimizer.step()
+    for net in (policy, critic):  # after the updates, so that a batch is learned with the scale it was collected with
+        net[0].train()(data[0])
+        net.eval()
     done = torch.cat(ended)
     if len(done):
         print(f"{(iteration + 1) * length * num_envs:>12,} steps  return {done.mean():.1f}  episodes {len(done)}")

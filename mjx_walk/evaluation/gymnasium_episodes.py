@@ -100,7 +100,7 @@ class ParallelEpisodes:
 
 
 def warn_of_differences(task: Task) -> None:
-    """Say in what the real Gymnasium differs from the task that was trained on: another model file, a flat floor.
+    """Log the differences of the real Gymnasium from the training task: another model file, a flat floor.
 
     Raises:
         UserError: the model file is gone.

@@ -12,7 +12,9 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from mjx_walk.envs import State, Task
 from mjx_walk.interop.gymnasium_programs import select_rows
+from mjx_walk.machine.devices import default_device
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.setting_fields import MAX_SEED
 from mjx_walk.utils.value_types import type_problem
 
 __all__ = ["BatchState", "EnvBatch", "Step"]
@@ -76,21 +78,22 @@ class EnvBatch:
         """Start an episode in each environment.
 
         Args:
-            state: of which the random numbers continue if there is no seed. None: a seed is drawn.
-            seed: an integer from 0 to 2³¹ - 1.
+            state: whose random numbers continue, unless a seed is given. None: a seed is drawn.
+            seed: an integer from 0 to 2³² - 1.
 
         Returns:
             The state and the observations.
 
         Raises:
-            UserError: another seed.
+            UserError: the seed is not such an integer.
         """
         if state is not None and seed is None:
             return self.init(state.key)
         seed = int(np.random.default_rng().integers(2**31)) if seed is None else seed
-        if type_problem(seed, int) or not 0 <= seed < 2**31:
-            raise UserError(f"seed={seed}: must be an integer from 0 to {2**31 - 1}")
-        return self.init(jax.random.PRNGKey(seed))
+        if type_problem(seed, int) or not 0 <= seed <= MAX_SEED:
+            raise UserError(f"seed={seed}: must be an integer from 0 to {MAX_SEED}")
+        # On a device by name, as actions from other libraries are. Otherwise the second step compiles again.
+        return self.init(jax.device_put(jax.random.PRNGKey(seed), default_device()))
 
     def _init(self, key: PRNGKeyArray) -> tuple[BatchState, Float[Array, "B observation_size"]]:
         env_key, starts_key, key = jax.random.split(key, 3)

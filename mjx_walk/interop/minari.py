@@ -1,4 +1,4 @@
-"""Datasets of a policy's episodes for Minari, the library of offline reinforcement learning beside Gymnasium."""
+"""Datasets of a policy's episodes for Minari, Gymnasium's library of offline datasets."""
 
 import contextlib
 import copy
@@ -54,7 +54,7 @@ def check_absent(path: Path) -> None:
     """Check that there is no such dataset yet, which is never overwritten.
 
     Raises:
-        UserError: there is.
+        UserError: the dataset exists.
     """
     if path.exists():
         raise UserError(f"{path} exists already; choose another out=, or remove it")

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from typing import Any
 
+import gymnasium
 import jax
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
@@ -44,7 +45,12 @@ class SB3Env(VecEnv):
         Returns:
             Observations after the resets, `[B, observation_size] f64`; rewards, `[B] f32`; `[B] bool`, where an
             episode ends; and `info`s. Those of ends have `terminal_observation` and `TimeLimit.truncated`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: `reset` was not called.
         """
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
         self._state, step = self._batch.step(self._state, self._actions)
         obs, final_obs, reward, terminated, truncated = map(np.array, jax.device_get(step[:5]))
         done = terminated | truncated
@@ -82,8 +88,8 @@ class SB3Env(VecEnv):
             UserError: always, since all environments are one program.
         """
         raise UserError(
-            f"'{method_name}' cannot be called: all environments are one program; use "
-            "stable_baselines3.common.env_util.make_vec_env('mjx_walk:mjx_walk/…', n)"
+            f"'{method_name}' cannot be called: all environments are one program; make one "
+            "environment with gymnasium.make"
         )
 
     def env_is_wrapped(self, wrapper_class: type, indices: int | Iterable[int] | None = None) -> list[bool]:

@@ -4,6 +4,7 @@ from typing import Any
 
 import gymnasium
 import jax
+import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
@@ -17,7 +18,7 @@ __all__ = ["TorchEnv", "shared_device"]
 
 
 class TorchEnv:
-    """B environments on one device, with the methods of Gymnasium's `VectorEnv` and tensors for arrays.
+    """B environments on one device. `reset` and `step` are those of Gymnasium's `VectorEnv`, with tensors for arrays.
 
     Finished environments reset in the same step.
     """
@@ -26,7 +27,7 @@ class TorchEnv:
 
     def __init__(self, batch: EnvBatch, device: torch.device):
         self.num_envs, self.device, self.dt = batch.num_envs, device, batch.task.dt
-        self.max_episode_steps = batch.task.max_episode_steps
+        self.max_episode_steps, self.options = batch.task.max_episode_steps, batch.task.options
         self.single_observation_space = batch.observation_space("float32")
         self.single_action_space = batch.action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -48,12 +49,12 @@ class TorchEnv:
         return torch.from_dlpack(obs), {}
 
     def step(
-        self, actions: torch.Tensor
+        self, actions: torch.Tensor | np.ndarray
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Step all environments, and reset those whose episode ends.
 
         Args:
-            actions: `[B, action_size]`, in Gymnasium's units. The motors clip them.
+            actions: `[B, action_size]`, a tensor or an array, in Gymnasium's units. The motors clip them.
 
         Returns:
             Observations after the resets, `[B, observation_size] f32`; rewards, `[B] f32`; `terminated` and
@@ -68,7 +69,7 @@ class TorchEnv:
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         check_action_shape(actions, (self.num_envs, self._batch.task.action_size))
-        actions = actions.detach().to(self.device, torch.float32).contiguous()
+        actions = torch.as_tensor(actions, dtype=torch.float32, device=self.device).detach().contiguous()
         self._state, step = self._batch.step(self._state, jax.dlpack.from_dlpack(actions))
         step = step._make(map(torch.from_dlpack, step))
         is_over = step.terminated | step.truncated
@@ -82,10 +83,13 @@ class TorchEnv:
 
     @property
     def episode_steps(self) -> torch.Tensor:
-        """Steps of the current episodes, `[B] i32`. They can be set, to spread the ends of the first episodes.
+        """Steps of the current episodes, `[B] i32`.
+
+        Set it to spread the ends of the first episodes. Writing into the tensor has no effect.
 
         Raises:
             gymnasium.error.ResetNeeded: `reset` was not called.
+            UserError: a tensor of another shape or of negative numbers is set.
         """
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset first")
@@ -95,7 +99,10 @@ class TorchEnv:
     def episode_steps(self, steps: torch.Tensor) -> None:
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset first")
-        array = jax.numpy.array(jax.dlpack.from_dlpack(steps.to(self.device, torch.int32).contiguous()))
+        steps = torch.as_tensor(steps, device=self.device)
+        if steps.shape != (self.num_envs,) or steps.min() < 0 or steps.max() >= 2**31:
+            raise UserError(f"episode_steps: give {self.num_envs} integers from 0 on, one for each environment")
+        array = jax.numpy.array(jax.dlpack.from_dlpack(steps.to(torch.int32).contiguous()))
         self._state = self._state.replace(env=self._state.env.replace(steps=array))
 
     def close(self) -> None:

@@ -17,13 +17,14 @@ if TYPE_CHECKING:
 
 __all__ = ["make_rsl_rl_env", "make_sb3_env", "make_torch_env"]
 
-_EXTRAS = {"torch": "torch", "stable_baselines3": "sb3", "rsl_rl": "rsl_rl", "tensordict": "rsl_rl"}
-"""Optional packages, and the extra that installs each."""
+_OPTIONAL = ("torch", "stable_baselines3", "rsl_rl", "tensordict")
+"""Packages that an extra installs."""
 
 
 def make_torch_env(
     env: str,
     num_envs: int,
+    *,
     device: Union[str, "torch.device", None] = None,
     physics: str = "auto",
     **options: object,
@@ -40,7 +41,7 @@ def make_torch_env(
     Raises:
         UserError: an unknown name, engine or option, PyTorch is missing, or it does not use JAX's device.
     """
-    module = _module("torch_env")
+    module = _module("torch_env", "torch")
     batch = EnvBatch(make_env(env, physics, **options), num_envs)
     return module.TorchEnv(batch, module.shared_device(device))
 
@@ -48,6 +49,7 @@ def make_torch_env(
 def make_rsl_rl_env(
     env: str,
     num_envs: int,
+    *,
     device: Union[str, "torch.device", None] = None,
     physics: str = "auto",
     seed: int | None = None,
@@ -66,10 +68,11 @@ def make_rsl_rl_env(
     Raises:
         UserError: an unknown name, engine or option, or rsl_rl is missing.
     """
-    return _module("rsl_rl_env").RslRlEnv(make_torch_env(env, num_envs, device, physics, **options), seed)
+    module = _module("rsl_rl_env", "rsl_rl")
+    return module.RslRlEnv(make_torch_env(env, num_envs, device=device, physics=physics, **options), seed)
 
 
-def make_sb3_env(env: str, num_envs: int, physics: str = "auto", **options: object) -> "VecMonitor":
+def make_sb3_env(env: str, num_envs: int, *, physics: str = "auto", **options: object) -> "VecMonitor":
     """Create environments for Stable-Baselines3, in a `VecMonitor`, so that its logs show returns.
 
     Args:
@@ -81,12 +84,12 @@ def make_sb3_env(env: str, num_envs: int, physics: str = "auto", **options: obje
     Raises:
         UserError: an unknown name, engine or option, or Stable-Baselines3 is missing.
     """
-    module = _module("sb3_env")
+    module = _module("sb3_env", "sb3")
     return module.VecMonitor(module.SB3Env(EnvBatch(make_env(env, physics, **options), num_envs)))
 
 
-def _module(name: str) -> ModuleType:
-    """A module of this room that imports an optional package.
+def _module(name: str, extra: str) -> ModuleType:
+    """A module of this room that imports optional packages, which an extra installs.
 
     Raises:
         UserError: the package is missing.
@@ -95,6 +98,6 @@ def _module(name: str) -> ModuleType:
         return importlib.import_module(f"mjx_walk.interop.{name}")
     except ModuleNotFoundError as error:
         package = str(error.name).partition(".")[0]
-        if package not in _EXTRAS:
+        if package not in _OPTIONAL:
             raise
-        raise UserError(f"{package} is missing: pip install 'mjx-walk[{_EXTRAS[package]}]'") from error
+        raise UserError(f"{package} is missing: pip install 'mjx-walk[{extra}]'") from error

@@ -80,9 +80,9 @@ def test_bad_numbers_are_refused(batch, num_envs):
         EnvBatch(batch.task, num_envs)
 
 
-@pytest.mark.parametrize("seed", [-1, 2**31, 1.5, "a"])
+@pytest.mark.parametrize("seed", [-1, 2**32, 1.5, "a"])
 def test_bad_seeds_are_refused(batch, seed):
-    with pytest.raises(UserError, match=r"seed=.*: must be an integer from 0 to 2147483647"):
+    with pytest.raises(UserError, match=r"seed=.*: must be an integer from 0 to 4294967295"):
         batch.reset(None, seed)
 
 
@@ -91,12 +91,15 @@ def test_bad_seeds_are_refused(batch, seed):
     [
         ("make_torch_env", "torch", "torch"),
         ("make_sb3_env", "stable_baselines3", "sb3"),
-        ("make_rsl_rl_env", "torch", "torch"),
+        ("make_rsl_rl_env", "torch", "rsl_rl"),
+        ("make_rsl_rl_env", "tensordict", "rsl_rl"),
     ],
 )
 def test_a_missing_package_is_named(monkeypatch, name, package, extra):
     for module in ("torch_env", "sb3_env", "rsl_rl_env"):
         monkeypatch.delitem(sys.modules, f"mjx_walk.interop.{module}", raising=False)
-    monkeypatch.setitem(sys.modules, package, None)
+    for loaded in [package, *sys.modules]:
+        if loaded.partition(".")[0] == package:
+            monkeypatch.setitem(sys.modules, loaded, None)
     with pytest.raises(UserError, match=rf"^{package} is missing: pip install 'mjx-walk\[{extra}\]'$"):
         getattr(mjx_walk, name)("hopper", 2)

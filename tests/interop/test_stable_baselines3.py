@@ -89,8 +89,30 @@ def test_a_seed_gives_the_same_episodes():
     first, second = (mjx_walk.make_sb3_env("hopper", 2, physics="c") for _ in range(2))
     first.seed(5)
     second.seed(5)
-    np.testing.assert_array_equal(first.reset(), second.reset())
-    assert not np.array_equal(first.reset(), second.reset()[::-1])
+    start = first.reset()
+    np.testing.assert_array_equal(start, second.reset())
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(300):
+        actions = rng.uniform(-1, 1, (2, 3))
+        (obs, _, dones, _), (others, *_) = first.step(actions), second.step(actions)
+        np.testing.assert_array_equal(obs, others)
+        ends += dones.sum()
+    assert ends > 2 and not np.array_equal(first.reset(), start)
+
+
+def test_its_wrappers_and_callbacks_take_the_environments(tmp_path):
+    vec_env = stable_baselines3.common.vec_env
+    env = vec_env.VecNormalize(mjx_walk.make_sb3_env("hopper", 4, physics="c"))
+    env.seed()  # it draws one below 2**32
+    evaluation = vec_env.VecNormalize(mjx_walk.make_sb3_env("hopper", 2, physics="c"), training=False)
+    callback = stable_baselines3.common.callbacks.EvalCallback(evaluation, eval_freq=32, log_path=tmp_path, verbose=0)
+    stable_baselines3.PPO("MlpPolicy", env, n_steps=32, batch_size=32, device="cpu").learn(256, callback)
+    assert len(np.load(tmp_path / "evaluations.npz")["results"]) == 2
+
+
+def test_a_step_needs_a_reset():
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        mjx_walk.make_sb3_env("hopper", 2, physics="c").step(np.zeros((2, 3)))
 
 
 def test_what_belongs_to_one_environment_is_refused():
