@@ -92,7 +92,6 @@ def test_bad_seeds_are_refused(batch, seed):
         ("make_torch_env", "torch", "torch"),
         ("make_sb3_env", "stable_baselines3", "sb3"),
         ("make_rsl_rl_env", "torch", "rsl_rl"),
-        ("make_rsl_rl_env", "tensordict", "rsl_rl"),
     ],
 )
 def test_a_missing_package_is_named(monkeypatch, name, package, extra):

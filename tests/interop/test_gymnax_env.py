@@ -92,6 +92,7 @@ def test_one_environment_and_nested_batches_agree(make_key):
 
 
 @pytest.mark.parametrize("physics", ["jax", "warp"])
+@pytest.mark.slow
 def test_other_engines(physics):
     env = GymnaxEnv("inverted_pendulum", physics, max_episode_steps=5)
     assert env.default_params.max_steps_in_episode == 5
