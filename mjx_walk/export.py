@@ -163,11 +163,12 @@ def _export_hub(arguments: Arguments, folder: RunFolder) -> Run:
     parsing.check_writable(path)
     run = load_run(folder.path, "c", arguments.policy or BEST)
     hub_folder.check_shareable(run)
-    scores = run.evaluate()
+    scores, command = run.evaluate(), hub_folder.command_of(run)
     with replacing_folder(path) as new:
-        hub_folder.write_run(new, run, scores)
+        hub_folder.write_run(new, run, scores, command)
         _write_onnx(new / hub_folder.ONNX, run, "float64")
-        hub_folder.write_card(new / hub_folder.CARD, path.name, run, scores, _film(run, new / hub_folder.FILM))
+        has_film = _film(run, new / hub_folder.FILM)
+        hub_folder.write_card(new / hub_folder.CARD, path.name, run, scores, command, has_film)
     print(f"{path}: {scores}")
     print(f"To share it: hf upload YOUR_NAME/{path.stem} {shlex.quote(str(path))}")
     return run

@@ -7,14 +7,14 @@ import yaml
 
 from mjx_walk.envs.model_files import is_asset
 from mjx_walk.evaluation.saved_policies import SavedPolicy
-from mjx_walk.settings.config import Config, training_command
-from mjx_walk.settings.saved_config import save_config
+from mjx_walk.settings.config import training_command
+from mjx_walk.settings.saved_config import read_saved_config, save_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import BEST, Scores, write_scores
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["CARD", "FILM", "ONNX", "check_shareable", "write_card", "write_run"]
+__all__ = ["CARD", "FILM", "ONNX", "check_shareable", "command_of", "write_card", "write_run"]
 
 CARD, FILM, ONNX = "README.md", "replay.mp4", "policy.onnx"
 """Names that the Hub shows, and the policy for programs without this package."""
@@ -24,9 +24,9 @@ _CARD = """
 
 A policy of mjx_walk, a trainer in JAX for Gymnasium's MuJoCo tasks.{film}
 
-| Mean return | 95% interval | Std over episodes | Episodes | Training steps |
-| ---: | ---: | ---: | ---: | ---: |
-| {mean:,.1f} | {low:,.1f} to {high:,.1f} | {std:,.1f} | {episodes} | {steps:,} |
+| Mean return | 95% interval from | to | Std over episodes | Episodes | Training steps |
+| ---: | ---: | ---: | ---: | ---: | ---: |
+| {mean:,.1f} | {low:,.1f} | {high:,.1f} | {std:,.1f} | {episodes} | {steps:,} |
 
 The policy acts without noise in Gymnasium. The interval is that of the mean over episodes, for this one policy.
 
@@ -62,24 +62,35 @@ def check_shareable(saved: SavedPolicy) -> None:
         raise UserError(f"format=hub shares policies of Gymnasium's tasks, and others lack {what}; choose format=onnx")
 
 
-def write_run(path: Path, saved: SavedPolicy, scores: Scores) -> None:
+def write_run(path: Path, saved: SavedPolicy, scores: Scores, command: str) -> None:
     """Write configuration, policy and scores, so that `run=PATH` takes the folder.
 
     Paths of the user are left out.
+
+    Args:
+        path: of the folder.
+        saved: the policy.
+        scores: its episodes in Gymnasium.
+        command: that trained it.
     """
     folder = RunFolder(path)
-    save_config(_without_paths(saved.config), folder.config)
+    config = dataclasses.replace(saved.config, physics="auto", run_dir=None, resume=False, wandb_project=None)
+    save_config(config, folder.config)
     checkpoint.save(folder.policy(BEST), saved.policy_params, saved.policy_metadata, as_numpy=True)
     block = scores.block(**saved.policy_metadata)
-    write_scores(folder.gymnasium_scores, scores.env, {BEST: block}, {"command": training_command(saved.config)})
+    write_scores(folder.gymnasium_scores, scores.env, {BEST: block}, {"command": command})
 
 
-def _without_paths(config: Config) -> Config:
-    env = dataclasses.replace(config.env, reward_function=None)
-    return dataclasses.replace(config, env=env, physics="auto", run_dir=None, resume=False, wandb_project=None)
+def command_of(saved: SavedPolicy) -> str:
+    """The command that trained a policy. It names a reward function's file without the user's folders."""
+    config = read_saved_config(RunFolder(saved.path))
+    own = config.env.reward_function
+    return training_command(
+        dataclasses.replace(config, env=dataclasses.replace(config.env, reward_function=own and Path(own).name))
+    )
 
 
-def write_card(path: Path, name: str, saved: SavedPolicy, scores: Scores, has_film: bool) -> None:
+def write_card(path: Path, name: str, saved: SavedPolicy, scores: Scores, command: str, has_film: bool) -> None:
     """Write the model card: facts for the Hub, and a page for people.
 
     Args:
@@ -87,6 +98,7 @@ def write_card(path: Path, name: str, saved: SavedPolicy, scores: Scores, has_fi
         name: of the folder.
         saved: the policy.
         scores: its episodes in Gymnasium.
+        command: that trained it.
         has_film: whether the folder holds a film.
     """
     algorithm, task = saved.config.algo.name, scores.env
@@ -114,7 +126,7 @@ def write_card(path: Path, name: str, saved: SavedPolicy, scores: Scores, has_fi
         steps=saved.policy_metadata["env_steps"],
         name=name,
         onnx=ONNX,
-        command=training_command(saved.config),
+        command=command,
     )
     front = yaml.safe_dump(facts, sort_keys=False)
     path.write_text(f"---\n{front}---\n{page}", encoding="utf-8")

@@ -1,15 +1,16 @@
 """Folders to share: other tools read the card, and commands take the folder as a run."""
 
 import re
+import shutil
 
 import numpy as np
 import pytest
 import yaml
-from helpers import CLONE, command_here
+from helpers import CLONE, OLD_RUNS, command_here, edit_config
 from small_robot import small_robot
 
 import mjx_walk
-from mjx_walk.interop.hub_folder import check_shareable
+from mjx_walk.interop.hub_folder import check_shareable, command_of
 from mjx_walk.storage.scores import read_scores
 from mjx_walk.utils.errors import UserError
 
@@ -49,6 +50,14 @@ def test_the_folder_is_a_run(folder, capsys):
 def test_no_path_of_the_user_is_shared(folder):
     shared = (folder / "config.yaml").read_text() + (folder / "README.md").read_text()
     assert str(folder.parent) not in shared and str(CLONE) not in shared
+
+
+def test_the_command_is_that_of_the_training(tmp_path):
+    """Also where a policy is scored without the run's reward and randomized physics."""
+    run = shutil.copytree(OLD_RUNS / "ppo", tmp_path / "run")
+    edit_config(run, "  reward_function: null\n", "  reward_function: /home/me/r.py:f\n  randomize:\n    observation_noise: 0.01\n")
+    command = command_of(mjx_walk.load_run(run, physics="c"))
+    assert "env.reward_function=r.py:f" in command and "/home" not in command and "env.randomize" in command
 
 
 def test_an_existing_folder_stays(folder, capsys):
