@@ -55,7 +55,8 @@ def test_no_path_of_the_user_is_shared(folder):
 def test_the_command_is_that_of_the_training(tmp_path):
     """Also where a policy is scored without the run's reward and randomized physics."""
     run = shutil.copytree(OLD_RUNS / "ppo", tmp_path / "run")
-    edit_config(run, "  reward_function: null\n", "  reward_function: /home/me/r.py:f\n  randomize:\n    observation_noise: 0.01\n")
+    own = "  reward_function: /home/me/r.py:f\n  randomize:\n    observation_noise: 0.01\n"
+    edit_config(run, "  reward_function: null\n", own)
     command = command_of(mjx_walk.load_run(run, physics="c"))
     assert "env.reward_function=r.py:f" in command and "/home" not in command and "env.randomize" in command
 
