@@ -30,8 +30,8 @@ __all__ = ["USAGE", "Arguments", "main"]
 USAGE = """
 usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [format=onnx] [dtype=float64|float32]
                                  [out=FILE.onnx]
-       python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=minari [episodes=1000] [seed=0]
-                                 [out=FOLDER]
+       python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=minari [episodes=1000]
+                                 [backend=gymnasium|sim] [seed=0] [out=FOLDER]
        python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=torch [out=FOLDER]
        python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=hub [out=FOLDER]
 
@@ -45,9 +45,11 @@ format=onnx, the policy:
                   units. It normalizes observations itself. Its metadata name the task, the policy and the motors.
   dtype=float64   of `observation`: Gymnasium's observations are float64
 
-format=minari, a dataset of the policy's episodes in the real Gymnasium, without noise:
+format=minari, a dataset of the policy's episodes, without noise:
   episodes=1000   complete episodes; those of Humanoid take about 3 MB each
-  seed=N          episode i is reset with N + i
+  backend=gymnasium   the real environment, on the CPU
+  backend=sim     the run's own engine, on the GPU if there is one; for every task, also your own
+  seed=N          in Gymnasium, episode i is reset with N + i; with backend=sim, all starts are drawn from N
   out=FOLDER      of datasets, by default Minari's own: $MINARI_DATASETS_PATH or ~/.minari/datasets. The dataset has a
                   folder of its own below it. An existing dataset is not overwritten.
 
@@ -69,6 +71,7 @@ class Arguments:
     format: str = setting("onnx", choices=("onnx", "minari", "torch", "hub"))
     dtype: str = setting("float64", choices=("float64", "float32"), only_if={"format": "onnx"})
     episodes: int = setting(1000, at_least=1, only_if={"format": "minari"})
+    backend: str = setting("gymnasium", choices=("gymnasium", "sim"), only_if={"format": "minari"})
     seed: int = setting(0, at_least=0, at_most=MAX_SEED, only_if={"format": "minari"})
     out: str | None = None
 
@@ -78,7 +81,8 @@ def main(command_line: list[str]) -> None:
     own = take_task(command_line)
     arguments = parsing.parse(Arguments, own, USAGE)
     refuse_ineffective(arguments, [argument.partition("=")[0] for argument in own])
-    parsing.stay_on_cpu()
+    if arguments.backend == "gymnasium":
+        parsing.stay_on_cpu()
     folder = zoo.open_run(arguments.run)
     run = _EXPORTS[arguments.format](arguments, folder)
     if arguments.policy is None and len(kept_policies(folder)) > 1:
@@ -125,16 +129,18 @@ def _export_minari(arguments: Arguments, folder: RunFolder) -> Run:
     except ImportError as error:
         raise UserError("format=minari needs Minari: pip install 'minari[hdf5]'") from error
     root = get_dataset_path() if arguments.out is None else user_path(arguments.out)
-    run = load_run(folder.path, "c", arguments.policy or BEST)
-    check_task(run.task)
-    path = root / dataset_id(run)
+    is_simulated = arguments.backend == "sim"
+    run = load_run(folder.path, None if is_simulated else "c", arguments.policy or BEST)
+    if not is_simulated:
+        check_task(run.task)
+    path = root / dataset_id(run, arguments.backend)
     check_absent(path)
     parsing.check_writable(path)
-    scores = write_dataset(root, run, arguments.episodes, arguments.seed)
+    scores = write_dataset(root, run, arguments.episodes, arguments.seed, arguments.backend)
     print(f"{path}: episodes of the {run.policy_name} policy (step {run.policy_metadata['env_steps']:,})")
     print(f"{scores}", "Load it in a shell and in Python:", sep="\n")
     print(f"  export MINARI_DATASETS_PATH={shlex.quote(str(root.absolute()))}")
-    print(f'  dataset = minari.load_dataset("{dataset_id(run)}")')
+    print(f'  dataset = minari.load_dataset("{dataset_id(run, arguments.backend)}")')
     return run
 
 
@@ -145,6 +151,8 @@ def _export_torch(arguments: Arguments, folder: RunFolder) -> Run:
     except ImportError as error:
         raise UserError("format=torch needs safetensors: pip install safetensors") from error
     path = user_path(arguments.out) if arguments.out else zoo.output_path(folder, "policy.torch")
+    if path.suffix in (".pt", ".pth", ".safetensors"):
+        raise UserError(f"out={arguments.out}: format=torch writes a folder with {WEIGHTS} and {MODULE}; name a folder")
     for name in (WEIGHTS, MODULE):
         parsing.check_writable(path / name)
     run = load_run(folder.path, "c", arguments.policy or BEST)
@@ -163,7 +171,7 @@ def _export_hub(arguments: Arguments, folder: RunFolder) -> Run:
     parsing.check_writable(path)
     run = load_run(folder.path, "c", arguments.policy or BEST)
     hub_folder.check_shareable(run)
-    scores, command = run.evaluate(), hub_folder.command_of(run)
+    scores, command = run.evaluate(), run.command
     with replacing_folder(path) as new:
         hub_folder.write_run(new, run, scores, command)
         _write_onnx(new / hub_folder.ONNX, run, "float64")

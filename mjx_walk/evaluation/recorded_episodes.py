@@ -14,7 +14,7 @@ from mjx_walk.evaluation.perturbations import Perturbation
 from mjx_walk.logs.progress import ScoringProgress
 from mjx_walk.utils.types import Act
 
-__all__ = ["RecordedEpisode", "record_episodes"]
+__all__ = ["RecordedEpisode", "episodes_at_once", "record_episodes"]
 
 _MAX_BYTES = 2**29
 """Memory that the episodes played at once may take."""
@@ -26,10 +26,10 @@ _NUM_INFOS = 16
 class RecordedEpisode:
     """One episode of T steps."""
 
-    seed: int
-    """Seed of its reset."""
+    seed: int | None
+    """Seed of its reset in Gymnasium."""
     observations: Float[np.ndarray, "T+1 observation_size"]
-    """As Gymnasium gives them, f64, from the reset to the last step."""
+    """In Gymnasium's order and units, f64, from the reset to the last step."""
     actions: Float[np.ndarray, "T action_size"]
     """f32, in Gymnasium's units."""
     rewards: Float[np.ndarray, " T"]
@@ -61,14 +61,14 @@ def record_episodes(task: Task, act: Act, seeds: list[int]) -> Generator[Recorde
         UserError: the model file is gone.
     """
     warn_of_differences(task)
-    size = _episodes_at_once(task)
+    size = episodes_at_once(task)
     rounds = [seeds[i : i + size] for i in range(0, len(seeds), size)]
     with contextlib.closing(ScoringProgress(len(seeds), len(rounds) * task.max_episode_steps, "recording")) as progress:
         for number, some in enumerate(rounds):
             yield from _play_round(task, act, some, progress, number * task.max_episode_steps, number * size)
 
 
-def _episodes_at_once(task: Task) -> int:
+def episodes_at_once(task: Task) -> int:
     """Number of episodes whose steps fit into memory; at least one for each core."""
     numbers = task.observation_size + task.action_size + _NUM_INFOS
     fitting = _MAX_BYTES // (8 * numbers * task.max_episode_steps)

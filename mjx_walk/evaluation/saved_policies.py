@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import logging
 import warnings
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,7 +18,7 @@ from mjx_walk.envs.physics import resolve_engine
 from mjx_walk.envs.pickling import ReadFiles, files_of, warn_of_changed_files
 from mjx_walk.envs.randomization.options import Randomization
 from mjx_walk.machine.compat import standard_settings
-from mjx_walk.settings.config import Config
+from mjx_walk.settings.config import Config, training_command
 from mjx_walk.settings.input_files import check_model, warn_of_changed_inputs
 from mjx_walk.settings.saved_config import read_saved_config
 from mjx_walk.storage import checkpoint
@@ -88,6 +89,14 @@ class SavedPolicy:
         vars(self).update(state)
         self._build()
         warn_of_changed_files(read_files)
+
+    @functools.cached_property
+    def command(self) -> str:
+        """The command that trained the policy. It names a reward function's file without the user's folders."""
+        saved = read_saved_config(RunFolder(self.path))
+        own = saved.env.reward_function
+        env = dataclasses.replace(saved.env, reward_function=own and Path(own).name)
+        return training_command(dataclasses.replace(saved, env=env))
 
     @functools.cached_property
     def act(self) -> Act:

@@ -7,14 +7,13 @@ import yaml
 
 from mjx_walk.envs.model_files import is_asset
 from mjx_walk.evaluation.saved_policies import SavedPolicy
-from mjx_walk.settings.config import training_command
-from mjx_walk.settings.saved_config import read_saved_config, save_config
+from mjx_walk.settings.saved_config import save_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import BEST, Scores, write_scores
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["CARD", "FILM", "ONNX", "check_shareable", "command_of", "write_card", "write_run"]
+__all__ = ["CARD", "FILM", "ONNX", "check_shareable", "write_card", "write_run"]
 
 CARD, FILM, ONNX = "README.md", "replay.mp4", "policy.onnx"
 """Names that the Hub shows, and the policy for programs without this package."""
@@ -79,15 +78,6 @@ def write_run(path: Path, saved: SavedPolicy, scores: Scores, command: str) -> N
     checkpoint.save(folder.policy(BEST), saved.policy_params, saved.policy_metadata, as_numpy=True)
     block = scores.block(**saved.policy_metadata)
     write_scores(folder.gymnasium_scores, scores.env, {BEST: block}, {"command": command})
-
-
-def command_of(saved: SavedPolicy) -> str:
-    """The command that trained a policy. It names a reward function's file without the user's folders."""
-    config = read_saved_config(RunFolder(saved.path))
-    own = config.env.reward_function
-    return training_command(
-        dataclasses.replace(config, env=dataclasses.replace(config.env, reward_function=own and Path(own).name))
-    )
 
 
 def write_card(path: Path, name: str, saved: SavedPolicy, scores: Scores, command: str, has_film: bool) -> None:

@@ -22,7 +22,8 @@ from mjx_walk import zoo
 from mjx_walk.envs import Task
 from mjx_walk.envs.model_files import is_asset
 from mjx_walk.evaluation.recorded_episodes import RecordedEpisode, record_episodes
-from mjx_walk.evaluation.saved_policies import SavedPolicy
+from mjx_walk.evaluation.saved_policies import SavedPolicy, deterministic_policy
+from mjx_walk.evaluation.simulated_episodes import simulate_episodes
 from mjx_walk.machine.signals import as_by_ctrl_c
 from mjx_walk.storage.files import write_text
 from mjx_walk.storage.folders import replacing_folder
@@ -40,14 +41,14 @@ _REQUIREMENTS = ("mujoco", "gymnasium")
 """Packages whose versions the episodes depend on. Minari warns if another version is installed."""
 
 
-def dataset_id(saved: SavedPolicy) -> str:
+def dataset_id(saved: SavedPolicy, backend: str) -> str:
     """Minari's id of a policy's dataset, such as `mjx_walk/walker2d/csac-v0` from the zoo.
 
-    A run gives `mjx_walk/walker2d/csac-best-v0` or `…/csac-final-v0`.
+    A run gives `mjx_walk/walker2d/csac-best-v0` or `…/csac-final-v0`. With the backend `sim`, it is `…/csac-sim-v0`.
     """
     task, algorithm = saved.config.env.name, saved.config.algo.name
     name = saved.path.name.removeprefix(f"{task}-") if zoo.holds(saved.path) else f"{algorithm}-{saved.policy_name}"
-    return f"{_NAMESPACE}/{task}/{name}-v0"
+    return f"{_NAMESPACE}/{task}/{name}{'-sim' if backend == 'sim' else ''}-v0"
 
 
 def check_absent(path: Path) -> None:
@@ -61,30 +62,37 @@ def check_absent(path: Path) -> None:
 
 
 def check_task(task: Task) -> None:
-    """Check that a dataset can name the environment, so that Minari makes it again anywhere.
+    """Check that Gymnasium makes the same environment anywhere, so that it can repeat the episodes.
 
     Raises:
         UserError: Gymnasium does not have the task, or only with another floor or model.
     """
+    missing = _missing_in_gymnasium(task)
+    if missing:
+        raise UserError(f"format=minari plays in Gymnasium, {missing}; add backend=sim")
+
+
+def _missing_in_gymnasium(task: Task) -> str:
+    """What Gymnasium lacks of a task; empty if it has everything."""
     xml_file = task.options.xml_file
     if not task.is_in_gymnasium:
-        raise UserError(f"Minari replays episodes in Gymnasium, which has no {task.gymnasium_id}; choose format=onnx")
+        return f"which has no {task.gymnasium_id}"
     if task.ground.is_on:
-        raise UserError("Minari replays episodes in Gymnasium, whose floor has no hills; choose format=onnx")
-    if xml_file and not is_asset(xml_file):
-        raise UserError(f"Minari replays episodes in Gymnasium, without your model {xml_file}; choose format=onnx")
+        return "whose floor has no hills"
+    return f"without your model {xml_file}" if xml_file and not is_asset(xml_file) else ""
 
 
-def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int) -> Scores:
-    """Play a policy in the real Gymnasium, and write its episodes as a dataset of Minari.
+def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int, backend: str) -> Scores:
+    """Play a policy, and write its episodes as a dataset of Minari.
 
     The dataset appears below `root` when it is complete. The policy acts without noise.
 
     Args:
         root: folder of datasets, as in `MINARI_DATASETS_PATH`.
-        saved: the policy, whose task `check_task` allows.
+        saved: the policy. For the backend `gymnasium`, `check_task` allows its task.
         num_episodes: N.
-        seed: episode i is reset with `seed + i`.
+        seed: in Gymnasium, episode i is reset with `seed + i`. In the engine, all starts are drawn from it.
+        backend: `gymnasium`, the real environment, or `sim`, the task's own engine.
 
     Returns:
         The returns and lengths of the episodes.
@@ -93,13 +101,13 @@ def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int) 
         UserError: the dataset exists already.
         OSError: the disk is full, or cannot be written.
     """
-    path = root.absolute() / dataset_id(saved)  # Minari measures the size of absolute paths only
+    path = root.absolute() / dataset_id(saved, backend)  # Minari measures the size of absolute paths only
     check_absent(path)
     namespaces = (path.parent, path.parent.parent)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with as_by_ctrl_c(), replacing_folder(path) as folder:
-            scores = _write(folder / "data", saved, [seed + i for i in range(num_episodes)])
+            scores = _write(folder / "data", saved, num_episodes, seed, backend)
         for namespace in namespaces:
             if not (namespace / NAMESPACE_METADATA_FILENAME).exists():
                 write_text(namespace / NAMESPACE_METADATA_FILENAME, "{}")
@@ -110,18 +118,37 @@ def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int) 
     return scores
 
 
-def _write(folder: Path, saved: SavedPolicy, seeds: list[int]) -> Scores:
+def _write(folder: Path, saved: SavedPolicy, num_episodes: int, seed: int, backend: str) -> Scores:
     """Write the files of a dataset."""
-    with contextlib.closing(make_gymnasium(saved.task)) as env:
-        storage = MinariStorage.new(folder, env.observation_space, env.action_space, _portable_spec(env, saved.task))
+    task = saved.task
+    storage = _new_storage(folder, task)
+    if backend == "sim":
+        seeds, name = [seed], f"{task.gymnasium_id} on {task.engine.name}"
+        recording = simulate_episodes(
+            task, deterministic_policy(saved.algorithm, saved.policy_params), num_episodes, seed
+        )
+    else:
+        seeds, name = [seed + i for i in range(num_episodes)], task.gymnasium_id
+        recording = record_episodes(task, saved.act, seeds)
     rewards: list[np.ndarray] = []
-    with contextlib.closing(record_episodes(saved.task, saved.act, seeds)) as episodes:
+    with contextlib.closing(recording) as episodes:
         storage.update_episodes(_buffers(episodes, rewards, folder))
     storage.update_episode_metadata(map(EpisodeMetadataCallback(), ({"rewards": own} for own in rewards)))
     returns, lengths = np.array([own.sum() for own in rewards]), np.array([len(own) for own in rewards])
-    scores = Scores(returns, lengths, seeds, saved.task.gymnasium_id)
-    storage.update_metadata(_metadata(saved, scores))
+    scores = Scores(returns, lengths, seeds, name)
+    storage.update_metadata(_metadata(saved, scores, backend))
     return scores
+
+
+def _new_storage(folder: Path, task: Task) -> MinariStorage:
+    """An empty dataset, which names the environment where Gymnasium has it."""
+    if not _missing_in_gymnasium(task):
+        with contextlib.closing(make_gymnasium(task)) as env:
+            return MinariStorage.new(folder, env.observation_space, env.action_space, _portable_spec(env, task))
+    observations = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float64)
+    return MinariStorage.new(
+        folder, observations, gymnasium.spaces.Box(np.asarray(task.action_low), np.asarray(task.action_high))
+    )
 
 
 def _portable_spec(env: gymnasium.Env, task: Task) -> EnvSpec:
@@ -142,13 +169,13 @@ def _buffers(episodes: Iterable[RecordedEpisode], rewards: list[np.ndarray], fol
         yield EpisodeBuffer(**{field.name: getattr(episode, field.name) for field in dataclasses.fields(episode)})
 
 
-def _metadata(saved: SavedPolicy, scores: Scores) -> dict[str, object]:
+def _metadata(saved: SavedPolicy, scores: Scores, backend: str) -> dict[str, object]:
     """Facts about the dataset: Minari's own, and those that Minari has no name for under `mjx_walk`."""
     policy, env_steps = saved.policy_name, saved.policy_metadata["env_steps"]
     source = f"{zoo.PREFIX if zoo.holds(saved.path) else ''}{saved.path.name}"  # the path may name the user
     versions = package_versions()
     return {
-        "dataset_id": dataset_id(saved),
+        "dataset_id": dataset_id(saved, backend),
         "minari_version": minari.__version__,
         "algorithm_name": saved.config.algo.name,
         "description": f"Episodes of the {policy} policy of {source} in {scores.env}, without noise.",
@@ -157,7 +184,8 @@ def _metadata(saved: SavedPolicy, scores: Scores) -> dict[str, object]:
             "run": source,
             "policy": policy,
             "env_steps": env_steps,
-            "backend": "gymnasium",
+            "backend": backend,
+            "physics": saved.task.engine.name if backend == "sim" else "c",
             "action_noise": "none",
             "seed": scores.seeds[0],
             "mean_return": scores.mean,

@@ -8,7 +8,6 @@ import jax
 from mjx_walk import zoo
 from mjx_walk.api import load_run
 from mjx_walk.cli import parsing
-from mjx_walk.settings.config import training_command
 from mjx_walk.settings.saved_config import save_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.scores import BEST, write_scores
@@ -64,7 +63,7 @@ def main(command_line: list[str]) -> None:
         scores.env,
         {BEST: scores.block(**run.policy_metadata)},
         {
-            "command": training_command(config),
+            "command": run.command,
             "num_runs": arguments.num_runs,
             "runs_mean": scores.mean if arguments.runs_mean is None else arguments.runs_mean,
         },

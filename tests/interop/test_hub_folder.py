@@ -10,7 +10,7 @@ from helpers import CLONE, OLD_RUNS, command_here, edit_config
 from small_robot import small_robot
 
 import mjx_walk
-from mjx_walk.interop.hub_folder import check_shareable, command_of
+from mjx_walk.interop.hub_folder import check_shareable
 from mjx_walk.storage.scores import read_scores
 from mjx_walk.utils.errors import UserError
 
@@ -57,7 +57,7 @@ def test_the_command_is_that_of_the_training(tmp_path):
     run = shutil.copytree(OLD_RUNS / "ppo", tmp_path / "run")
     own = "  reward_function: /home/me/r.py:f\n  randomize:\n    observation_noise: 0.01\n"
     edit_config(run, "  reward_function: null\n", own)
-    command = command_of(mjx_walk.load_run(run, physics="c"))
+    command = mjx_walk.load_run(run, physics="c").command
     assert "env.reward_function=r.py:f" in command and "/home" not in command and "env.randomize" in command
 
 

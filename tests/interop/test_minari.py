@@ -15,7 +15,7 @@ from small_robot import small_robot
 import mjx_walk
 from mjx_walk.envs import make_env
 from mjx_walk.envs.model_files import ASSETS
-from mjx_walk.evaluation import recorded_episodes
+from mjx_walk.evaluation import recorded_episodes, simulated_episodes
 from mjx_walk.utils.errors import UserError
 
 minari = pytest.importorskip("minari", reason="pip install 'minari[hdf5]'")
@@ -109,6 +109,45 @@ def test_datasets_can_be_combined_and_split(load):
     assert len(first.sample_episodes(2)) == 2 and "reward_dist" in repr(second[0])
 
 
+def test_episodes_of_the_engine_are_those_that_it_scores(datasets, load, monkeypatch):
+    """Three episodes in batches of two, which fall at different times."""
+    run = datasets / ".runs" / "falls"
+    monkeypatch.setattr(simulated_episodes, "episodes_at_once", lambda task: 2)
+    monkeypatch.setattr(simulated_episodes, "_CHUNK", 7)
+    assert export(f"run={run}", "episodes=3", "seed=5", "backend=sim", f"out={datasets}") == 0
+    dataset = load("mjx_walk/walker2d/ppo-best-sim-v0")
+    scores = mjx_walk.load_run(run).evaluate(3, backend="sim", seed=5)
+    episodes = list(dataset.iterate_episodes())
+    assert [len(episode) for episode in episodes] == scores.lengths.tolist() and len({*scores.lengths}) > 1
+    np.testing.assert_allclose([episode.rewards.sum() for episode in episodes], scores.returns, rtol=1e-5)
+    act = mjx_walk.load_run(run).policy
+    for episode in episodes:
+        assert episode.terminations.nonzero()[0].tolist() == [len(episode) - 1] and not episode.truncations.any()
+        np.testing.assert_allclose(episode.actions, act(episode.observations[:-1]), atol=1e-6)
+        terms = [episode.infos[name][1:] for name in ("reward_forward", "reward_ctrl", "reward_survive")]
+        np.testing.assert_allclose(np.sum(terms, 0), episode.rewards, atol=1e-5)
+        assert np.isnan(episode.infos["reward_forward"][0])
+    assert dataset.recover_environment().spec.id == "Walker2d-v4"
+    own = minari.load_dataset("mjx_walk/walker2d/ppo-best-sim-v0").storage.metadata["mjx_walk"]
+    assert (own["backend"], own["physics"], own["seed"]) == ("sim", "c", 5)
+    shutil.rmtree(datasets / "mjx_walk" / "walker2d" / "ppo-best-sim-v0")
+
+
+def test_the_engine_plays_what_gymnasium_lacks(datasets, tmp_path, capsys):
+    """Minari then knows the spaces, and no environment."""
+    run = shutil.copytree(OLD_RUNS / "ppo", tmp_path / "hills")
+    edit_config(run, "  version: v5\n", "  version: v5\n  ground:\n    slope: 15.0\n")
+    assert export(f"run={run}", "episodes=1", f"out={tmp_path}/new") == 2
+    assert capsys.readouterr().err == (
+        "error: format=minari plays in Gymnasium, whose floor has no hills; add backend=sim\n"
+    )
+    assert export(f"run={run}", "episodes=1", "backend=sim", f"out={tmp_path}/new") == 0
+    dataset = minari.MinariDataset(tmp_path / "new" / "mjx_walk" / "walker2d" / "ppo-best-sim-v0" / "data")
+    (episode,) = dataset.iterate_episodes()
+    assert dataset.env_spec is None
+    assert dataset.observation_space.contains(episode.observations[0]) and dataset.action_space.shape == (6,)
+
+
 def test_example_of_the_documentation(datasets):
     (example,) = [block for block in blocks("python") if block.startswith("# read_dataset.py")]
     example = example.replace("mjx_walk/walker2d/csac-v0", REACHER)
@@ -134,7 +173,7 @@ def test_what_gymnasium_cannot_replay_is_refused(tmp_path):
     (tmp_path / "robot.xml").write_text(small_robot())
     (tmp_path / "walker.xml").write_text((ASSETS / "walker2d.xml").read_text())
     for name, options, message in (
-        ("locomotion", {"xml_file": tmp_path / "robot.xml"}, "which has no locomotion; choose format=onnx"),
+        ("locomotion", {"xml_file": tmp_path / "robot.xml"}, "which has no locomotion; add backend=sim"),
         ("walker2d", {"xml_file": tmp_path / "walker.xml"}, "without your model"),
         ("walker2d", {"ground": {"slope": 15.0}}, "whose floor has no hills"),
     ):
@@ -150,6 +189,8 @@ def test_mistakes_print_one_line_and_leave_nothing(datasets, tmp_path, monkeypat
         (("out=",), "a path is empty"),
         (("out=file",), "file is a file; choose another path"),
         ((f"out={datasets}",), f"{datasets}/{REACHER} exists already; choose another out=, or remove it"),
+        (("backend=real",), "backend=real: choose one of: gymnasium, sim"),
+        (("format=onnx", "backend=sim"), "backend=sim has no effect with format=onnx"),
     ):
         assert export("run=zoo:reacher-csac", *arguments) == 2
         (line,) = capsys.readouterr().err.splitlines()

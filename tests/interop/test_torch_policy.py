@@ -68,6 +68,14 @@ def test_files_describe_the_policy(tmp_path):
     assert {"mean", "std", "low", "high", "network.0.weight", "network.4.bias"} < names
 
 
+def test_the_name_of_a_file_is_refused(tmp_path, capsys):
+    assert command_here("export", "run=zoo:hopper-csac", "format=torch", f"out={tmp_path}/policy.safetensors") == 2
+    assert (
+        "format=torch writes a folder with policy.safetensors and policy.py; name a folder" in capsys.readouterr().err
+    )
+    assert not any(tmp_path.iterdir())
+
+
 def test_networks_that_pytorch_lacks_are_refused(tmp_path, monkeypatch):
     run = mjx_walk.load_run(zoo.open_run("zoo:hopper-csac").path, physics="c")
     monkeypatch.setattr(run.config.algo, "activation", "gelu")
