@@ -1,5 +1,6 @@
 """The programs of `benchmarks` run, and count what they report."""
 
+import importlib.util
 import json
 import re
 import runpy
@@ -27,7 +28,16 @@ def exit_code(name, *arguments):
 
 def test_programs_that_the_documentation_names_are_there(capsys):
     named = {name for text in PAGES.values() for name in re.findall(r"python benchmarks/(\S+\.py)", text)}
-    assert named == {"adapters.py", "hills.py", "mujoco_versions.py", "peers.py", "training_parts.py"}
+    assert named == {
+        "adapters.py",
+        "hills.py",
+        "mujoco_versions.py",
+        "peers.py",
+        "sbx_training.py",
+        "training_parts.py",
+    }
+    if importlib.util.find_spec("sbx") is None:
+        named.remove("sbx_training.py")
     for name in named:
         assert exit_code(name, "--help") == 0
         assert capsys.readouterr().out.startswith(f"usage: python benchmarks/{name} ")
@@ -39,6 +49,21 @@ def test_policies_are_scored_on_hills(monkeypatch, capsys):
     header, row = capsys.readouterr().out.splitlines()
     assert header == "Run,slopes,steps,rough,mixed"
     assert row.startswith("zoo:hopper-ppo,") and all(100 < float(mean) < 3000 for mean in row.split(",")[1:])
+
+
+@pytest.mark.slow
+def test_a_training_of_sbx_continues_and_is_scored(tmp_path, monkeypatch):
+    """The first call ends after its first step."""
+    pytest.importorskip("sbx", reason="pip install sbx-rl")
+    settings = ("--env", "inverted_pendulum", "--every", "20", "--episodes", "5", "--out", str(tmp_path))
+    for total, seconds in (("60", "0"), ("60", "1000")):
+        monkeypatch.setattr(sys, "argv", ["sbx_training.py", *settings, "--total-steps", total, "--seconds", seconds])
+        runpy.run_path(str(CLONE / "benchmarks" / "sbx_training.py"), run_name="__main__")
+    header, *rows = (line.split(",") for line in (tmp_path / "returns.csv").read_text().splitlines())
+    assert header == ["steps", "seconds", "episodes", "mean", "std"]
+    assert [row[0] for row in rows] == ["1", "20", "40", "60"] and [row[2] for row in rows] == ["1", "1", "1", "5"]
+    seconds = [float(row[1]) for row in rows]
+    assert seconds == sorted(seconds) and all(1 <= float(row[3]) <= 1000 for row in rows)
 
 
 @pytest.mark.slow

@@ -1,0 +1,129 @@
+"""`python benchmarks/sbx_training.py --algo tqc --env humanoid --out DIR`: returns of SBX over steps and seconds."""
+
+import argparse
+import dataclasses
+import pickle
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+import sbx
+from sbx.common.off_policy_algorithm import OffPolicyAlgorithmJax
+from stable_baselines3.common.callbacks import BaseCallback
+
+from mjx_walk.envs import BUILT_IN_TASKS, make_env
+from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium
+from mjx_walk.logs.metrics import write_csv
+from mjx_walk.storage.files import replacing
+from mjx_walk.storage.scores import Scores
+
+__all__ = ["Keeper", "Kept", "resumed", "score"]
+
+_DESCRIPTION = """
+Train SAC or TQC of Stable-Baselines JAX (SBX) in one environment of Gymnasium. Settings are those of rl-baselines3-zoo
+for MuJoCo: SBX's defaults and 10,000 random steps. Policies are kept on the way. At the end, score them on the episodes
+of `python -m mjx_walk.eval` and write DIR/returns.csv. After --seconds the training is saved, and the same command
+continues it.
+"""
+_ALGORITHMS = {"sac": sbx.SAC, "tqc": sbx.TQC}
+_LEARNING_STARTS = 10_000
+
+
+@dataclasses.dataclass
+class Kept:
+    """A policy on the way."""
+
+    steps: int
+    seconds: float
+    """Of training until then, with compiling and without saving."""
+    params: Any
+    """Of the actor, on the host."""
+
+
+class Keeper(BaseCallback):
+    """Keeps policies, and ends the training after a time.
+
+    Args:
+        every: steps between two policies.
+        seconds: of this call.
+        kept: policies so far.
+    """
+
+    def __init__(self, every: int, seconds: float, kept: list[Kept]):
+        super().__init__()
+        self.kept = kept
+        self._every = every
+        self._seconds = seconds
+        self._before = kept[-1].seconds if kept else 0.0
+        self._started = time.monotonic()
+
+    def keep(self) -> None:
+        """Keep the present policy, in place of one of the same step."""
+        if self.kept and self.kept[-1].steps == self.num_timesteps:
+            self.kept.pop()
+        params = jax.device_get(self.model.policy.actor_state.params)
+        self.kept.append(Kept(self.num_timesteps, self._before + time.monotonic() - self._started, params))
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % self._every == 0:
+            self.keep()
+        return time.monotonic() - self._started < self._seconds
+
+
+def resumed(folder: Path, algo: str, env: gymnasium.Env, seed: int) -> tuple[OffPolicyAlgorithmJax, list[Kept]]:
+    """The training of a folder as it was saved, with the policies kept so far; a new one in an empty folder."""
+    kind = _ALGORITHMS[algo]
+    if not (folder / "kept.pickle").exists():
+        return kind("MlpPolicy", env, seed=seed, learning_starts=_LEARNING_STARTS), []
+    model = kind.load(folder / "model.zip", env)
+    model.load_replay_buffer(folder / "replay.pkl")
+    return model, pickle.loads((folder / "kept.pickle").read_bytes())
+
+
+def score(model: OffPolicyAlgorithmJax, task_name: str, kept: Kept, episodes: int) -> Scores:
+    """Scores of a kept policy in Gymnasium, without noise."""
+    model.policy.actor_state = model.policy.actor_state.replace(params=kept.params)
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        return model.predict(obs, deterministic=True)[0]
+
+    return score_in_gymnasium(make_env(task_name, physics="c"), act, episodes)  # type: ignore[arg-type]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser("python benchmarks/sbx_training.py", description=_DESCRIPTION)
+    parser.add_argument("--algo", choices=_ALGORITHMS, default="tqc")
+    parser.add_argument("--env", choices=BUILT_IN_TASKS, required=True)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--total-steps", type=int, default=1_000_000)
+    parser.add_argument("--every", type=int, default=100_000, help="steps between two kept policies")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="of this call, after which it is saved")
+    parser.add_argument("--episodes", type=int, default=100, help="of the last policy; the others have a fifth of them")
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    env = gymnasium.make(make_env(given.env, physics="c").gymnasium_id)
+    model, kept = resumed(given.out, given.algo, env, given.seed)
+    keeper = Keeper(given.every, given.seconds, kept)
+    left = given.total_steps - model.num_timesteps
+    if left > 0:
+        model.learn(left, keeper, reset_num_timesteps=not kept)
+        keeper.keep()
+        model.save(given.out / "model.zip")
+        model.save_replay_buffer(given.out / "replay.pkl")
+        with replacing(given.out / "kept.pickle") as new:
+            new.write_bytes(pickle.dumps(kept))
+    rows = []
+    for one in kept:
+        scores = score(model, given.env, one, given.episodes if one is kept[-1] else -(-given.episodes // 5))
+        figures = {"mean": round(scores.mean, 2), "std": round(scores.std, 2)}
+        rows.append({"steps": one.steps, "seconds": round(one.seconds, 1), "episodes": len(scores.returns)} | figures)
+        print(rows[-1], flush=True)
+    write_csv(rows, given.out / "returns.csv")
+
+
+if __name__ == "__main__":
+    main()
