@@ -64,7 +64,8 @@ class Keeper(BaseCallback):
         """Keep the present policy, in place of one of the same step."""
         if self.kept and self.kept[-1].steps == self.num_timesteps:
             self.kept.pop()
-        params = jax.device_get(self.model.policy.actor_state.params)
+        policy: Any = self.model.policy
+        params = jax.device_get(policy.actor_state.params)
         self.kept.append(Kept(self.num_timesteps, self._before + time.monotonic() - self._started, params))
 
     def _on_step(self) -> bool:

@@ -52,6 +52,7 @@ PROGRAMS = {
     "in_torch.py": "",
     "train_many_sb3.py": "",
     "in_rsl_rl.py": "",
+    "follow_a_training.py": r"step [\d,]+: return \d+\n",
 }
 """Python blocks that run on their own, with a pattern of what they print."""
 NEEDS = {"train_sb3.py": "stable_baselines3", "train_many_sb3.py": "stable_baselines3", "in_torch.py": "torch"}
