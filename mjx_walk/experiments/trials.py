@@ -1,0 +1,266 @@
+"""The trials of a study: each one is a training in a process of its own, whose evaluations Optuna gets as they end."""
+
+import bisect
+import contextlib
+import dataclasses
+import itertools
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mjx_walk.experiments.job_logs import failure_reason
+from mjx_walk.experiments.planned_runs import PlannedRun, start_job
+from mjx_walk.experiments.search_space import SearchSpace
+from mjx_walk.experiments.study import TICKS, StudyFolder, TakenTrial
+from mjx_walk.logs.metrics import Row, read_rows
+from mjx_walk.machine.signals import Interrupt
+from mjx_walk.settings.config import load_config
+from mjx_walk.storage import checkpoint
+from mjx_walk.storage.files import check_replaceable, refuse_links
+from mjx_walk.utils.errors import UserError
+
+if TYPE_CHECKING:
+    import optuna
+
+__all__ = ["NUM_EVALUATIONS", "Tuning", "run_trials", "value_at"]
+
+NUM_EVALUATIONS = 3
+"""Newest evaluations during training whose mean is the value of a trial."""
+_SECONDS_BETWEEN_LOOKS = 1.0
+_SECONDS_BETWEEN_REPORTS = 30.0
+_FAILURES_TO_STOP = 3
+"""A study ends when its first trials all fail."""
+_ADVICE = "so try a smaller num_envs or per_device=1"
+
+
+@dataclasses.dataclass(frozen=True)
+class Tuning:
+    """How the trials of a study are chosen and trained."""
+
+    folder: StudyFolder
+    space: SearchSpace
+    seeds: list[int]
+    """Training seeds of each trial."""
+    num_trials: int
+    """Trials of the complete study."""
+    sampler: str
+    pruner: str
+    seed: int
+    """Seed of the sampler."""
+
+    def take_trial(self, study: "optuna.Study") -> TakenTrial | None:
+        """See `StudyFolder.take_trial`."""
+        return self.folder.take_trial(study, self.space, self.num_trials, self.sampler, self.pruner, self.seed)
+
+    def job(self, number: int, values: dict[str, Any]) -> list[PlannedRun]:
+        """The runs of a trial, one for each seed.
+
+        Raises:
+            UserError: the values do not fit together.
+        """
+        overrides, folder = self.space.overrides(values), self.folder.trial_folder(number)
+        refuse_links(folder, self.folder.path)
+        config = load_config(overrides)
+        configs = (dataclasses.replace(config, seed=seed, run_dir=str(folder / f"seed_{seed}")) for seed in self.seeds)
+        return [PlannedRun(folder.name, tuple(overrides), config) for config in configs]
+
+
+@dataclasses.dataclass
+class _Training:
+    """A trial whose process is running."""
+
+    taken: TakenTrial
+    job: list[PlannedRun]
+    process: subprocess.Popen
+    log: Path
+    device: int | None
+    reported: set[int]
+    """Ticks that Optuna knows."""
+    num_bytes: int = 0
+    """Size of the metrics that were read last."""
+    is_pruned: bool = False
+
+
+def value_at(logs: list[list[Row]], total_steps: int, tick: int = TICKS) -> float | None:
+    """The value of a trial after a part of its training.
+
+    It is the mean over seeds of the mean of the last `NUM_EVALUATIONS` evaluations. Those of untrained policies do not
+    count.
+
+    Args:
+        logs: rows of `metrics.jsonl` of each seed.
+        total_steps: environment steps of the complete training.
+        tick: number of parts of the training, from 1 to `TICKS`.
+
+    Returns:
+        The value, or None if a seed has not come that far or has no evaluation.
+    """
+    means = []
+    for rows in logs:
+        index = bisect.bisect_left(rows, tick * total_steps, key=lambda row: row["env_steps"] * TICKS)
+        if index == len(rows):
+            return None
+        evaluations = [row["eval/return"] for row in rows[: index + 1] if _is_evaluated(row)][-NUM_EVALUATIONS:]
+        if not evaluations:
+            return None
+        means.append(sum(evaluations) / len(evaluations))
+    return sum(means) / len(means)
+
+
+def _is_evaluated(row: Row) -> bool:
+    return row.get("eval/return") is not None and (row.get("eval/env_steps") or 0) > 0
+
+
+def run_trials(
+    tuning: Tuning,
+    study: "optuna.Study",
+    devices: list[int | None],
+    on_end: Callable[[int], None],
+    on_progress: Callable[[PlannedRun], None] = lambda _: None,
+) -> str | None:
+    """Run trials until the study is complete or a signal arrives, one at a time on each device.
+
+    Args:
+        tuning: what to run.
+        study: see `StudyFolder`.
+        devices: GPUs, each repeated as often as trials may share it; `[None]` for the CPU.
+        on_end: called with the number of each trial that has ended.
+        on_progress: called now and then with each run that is being trained.
+
+    Returns:
+        Name of the signal that stopped it early, else None. All trainings have then saved their state.
+
+    Raises:
+        UserError: the first trials have all failed.
+    """
+    free = list(devices)
+    share = len(devices) // len(set(devices))
+    running: list[_Training] = []
+    last_report = time.monotonic()
+    with Interrupt("the trials are saving") as interrupt:
+        try:
+            while not interrupt.signal_name:
+                while free:
+                    taken = tuning.take_trial(study)
+                    if taken is None:
+                        break
+                    training = _start(tuning, study, taken, free[0], share)
+                    if training:
+                        running.append(training)
+                        free.pop(0)
+                    else:
+                        on_end(taken.trial.number)
+                        _stop_if_hopeless(study, tuning.folder)
+                if not running:
+                    break
+                time.sleep(_SECONDS_BETWEEN_LOOKS)
+                for training in list(running):
+                    has_ended = training.process.poll() is not None  # asked first: all that it wrote is read then
+                    _report(training)
+                    if has_ended:
+                        running.remove(training)
+                        free.append(training.device)
+                        _end(study, training.taken, training.job, training)
+                        on_end(training.taken.trial.number)
+                        _stop_if_hopeless(study, tuning.folder)
+                if time.monotonic() - last_report > _SECONDS_BETWEEN_REPORTS:
+                    last_report = time.monotonic()
+                    for run in itertools.chain.from_iterable(training.job for training in running):
+                        on_progress(run)
+        finally:  # after an error, too, no training may outlive this process
+            for training in running:
+                training.process.send_signal(signal.SIGTERM)
+            for training in running:
+                training.process.wait()
+                training.taken.release.close()
+    return interrupt.signal_name
+
+
+def _start(
+    tuning: Tuning, study: "optuna.Study", taken: TakenTrial, device: int | None, share: int
+) -> _Training | None:
+    """Start the process of a trial. None for a trial that ends at once, because it is complete or invalid."""
+    trial, job = taken.trial, []
+    log = tuning.folder.logs / f"trial_{trial.number:04d}.txt"
+    try:
+        job = tuning.job(trial.number, trial.params)
+        if all(run.is_finished for run in job):
+            _end(study, taken, job)
+            return None
+        refuse_links(log, log.parent)
+        check_replaceable(log)
+        job.sort(key=lambda run: run.steps_saved or 0)  # if one of them has saved nothing, all begin again
+        process = start_job(job, log, device, share, taken.lock, ends_with_parent=True)
+    except UserError as error:
+        _fail(study, taken, str(error))
+        return None
+    reported = set(study.get_trials(deepcopy=False)[trial.number].intermediate_values)
+    return _Training(taken, job, process, log, device, reported)
+
+
+def _report(training: _Training) -> None:
+    """Report the evaluations that are new, and stop a trial that is to be pruned. The recipe's own is never pruned."""
+    files = [run.folder.metrics for run in training.job]
+    num_bytes = sum(file.stat().st_size for file in files if file.exists())
+    if training.is_pruned or num_bytes == training.num_bytes:
+        return
+    training.num_bytes = num_bytes
+    trial, logs = training.taken.trial, [read_rows(file) for file in files]
+    for tick in range(1, TICKS + 1):
+        value = value_at(logs, training.job[0].config.total_steps, tick)
+        if value is None or tick in training.reported:
+            continue
+        trial.report(value, tick)
+        training.reported.add(tick)
+        if tick < TICKS and trial.number > 0 and trial.should_prune():
+            training.is_pruned = True
+            training.process.send_signal(signal.SIGTERM)
+            return
+
+
+def _end(study: "optuna.Study", taken: TakenTrial, job: list[PlannedRun], training: _Training | None = None) -> None:
+    """Tell Optuna how a trial has ended, and remove what only a resume needs."""
+    from optuna.trial import TrialState
+
+    value = value_at([read_rows(run.folder.metrics) for run in job], job[0].config.total_steps)
+    if training and training.is_pruned:
+        study.tell(taken.trial, state=TrialState.PRUNED)
+    elif not all(run.is_finished for run in job):
+        assert training
+        code = training.process.returncode
+        by_signal = f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        reason = failure_reason(training.log, _ADVICE) or by_signal
+        _fail(study, taken, f"{reason}; see {training.log}")
+        return
+    elif value is None:
+        steps = job[0].config.total_steps
+        _fail(study, taken, f"no evaluation of a trained policy ended within total_steps={steps}; raise it")
+        return
+    else:
+        study.tell(taken.trial, value)
+    for run in job:
+        for path in checkpoint.list_steps(run.folder.checkpoints):
+            with contextlib.suppress(OSError):
+                shutil.rmtree(path)
+    taken.release.close()
+
+
+def _fail(study: "optuna.Study", taken: TakenTrial, reason: str) -> None:
+    from optuna.trial import TrialState
+
+    taken.trial.set_user_attr("reason", reason)
+    study.tell(taken.trial, state=TrialState.FAIL)
+    taken.release.close()
+
+
+def _stop_if_hopeless(study: "optuna.Study", folder: StudyFolder) -> None:
+    """Stop if nothing but failures has ended."""
+    from optuna.trial import TrialState
+
+    ended = [trial.state for trial in study.get_trials(deepcopy=False) if trial.state.is_finished()]
+    if len(ended) >= _FAILURES_TO_STOP and set(ended) == {TrialState.FAIL}:
+        raise UserError(f"the first {len(ended)} trials have all failed; remove {folder.path}, and correct the command")
