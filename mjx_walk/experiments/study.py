@@ -180,8 +180,8 @@ class StudyFolder:
             facts = Facts(**study.user_attrs[_NAME])
         except (KeyError, TypeError) as error:
             raise UserError(f"{self.storage} holds a study of another program; choose another out=DIR") from error
-        kinds = {field.name: typing.get_origin(field.type) or field.type for field in dataclasses.fields(Facts)}
-        if not all(isinstance(getattr(facts, name), kind) for name, kind in kinds.items()):
+        kinds = typing.get_type_hints(Facts).items()
+        if not all(isinstance(getattr(facts, name), typing.get_origin(kind) or kind) for name, kind in kinds):
             raise UserError(f"{self.storage} holds a study of another program; choose another out=DIR")
         return facts
 
@@ -263,7 +263,7 @@ def _refuse_other(saved: Facts, asked: Facts, folder: Path) -> None:
         raise UserError(f"{folder} holds a study with other settings ({in_short(differing)}); choose another out=DIR")
 
 
-def _distribution(values: Interval | Choices) -> object:
+def _distribution(values: Interval | Choices) -> "optuna.distributions.BaseDistribution":
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     if isinstance(values, Choices):

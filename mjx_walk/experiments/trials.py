@@ -101,7 +101,7 @@ def value_at(logs: list[list[Row]], total_steps: int, tick: int = TICKS) -> floa
     """
     means = []
     for rows in logs:
-        index = bisect.bisect_left(rows, tick * total_steps, key=lambda row: row["env_steps"] * TICKS)
+        index = bisect.bisect_left([row["env_steps"] * TICKS for row in rows], tick * total_steps)
         if index == len(rows):
             return None
         evaluations = [row["eval/return"] for row in rows[: index + 1] if _is_evaluated(row)][-NUM_EVALUATIONS:]

@@ -239,8 +239,8 @@ def _figures(study: "optuna.Study", facts: Facts) -> list[tuple[str, str, str]]:
     ranges, found = list(facts.ranges), []
     for title, text, name, options in _FIGURES:
         options = options | ({"params": ranges} if "params" in options else {})
-        size = {"figure.figsize": options.pop("size", _SIZE), "text.parse_math": True}  # its axes have powers of ten
-        with warnings.catch_warnings(), plt.rc_context(size):
+        style: dict[Any, Any] = {"figure.figsize": options.pop("size", _SIZE), "text.parse_math": True}
+        with warnings.catch_warnings(), plt.rc_context(style):
             warnings.simplefilter("ignore")  # Optuna calls its figures experimental
             try:
                 axes = getattr(optuna_figures, name)(study, **options)
