@@ -68,6 +68,8 @@ def main(command_line: list[str]) -> int:
     arguments, overrides = parsing.parse_own(Arguments, Config, command_line, USAGE, key_of_value)
     if arguments.out is not None and user_path(arguments.out).is_file():
         raise UserError(f"out={arguments.out} is a file; give a folder")
+    if "${" in (arguments.out or ""):
+        raise UserError(f"out={arguments.out}: '${{' names another setting; choose a name without it")
     if arguments.draw:
         if arguments.out is None:
             raise UserError("say which study to draw: out=DIR")

@@ -157,8 +157,7 @@ def summary(folder: StudyFolder, study: "optuna.Study") -> str:
 
 
 def _train_command(folder: StudyFolder, facts: Facts) -> str:
-    words = ["python", "-m", "mjx_walk.train", *facts.chosen, f"recipe={_recipe_files(folder)[0]}"]
-    return shlex.join(words)
+    return f"python -m mjx_walk.train {shlex.join([*facts.chosen, f'recipe={_recipe_files(folder)[0]}'])}"
 
 
 def _compare_command(folder: StudyFolder, facts: Facts, num_recipes: int) -> str:
@@ -168,7 +167,7 @@ def _compare_command(folder: StudyFolder, facts: Facts, num_recipes: int) -> str
     words += [f"algos=[{facts.settings['algo.name']}]", f"recipe={','.join(files)}"]
     words += [f"{key}={_word(value)}" for key, value in facts.changes.items()]
     seeds = ",".join(map(str, range(first, first + _NUM_SEEDS)))
-    return shlex.join(["python", "-m", "mjx_walk.compare", *words, f"seeds=[{seeds}]"])
+    return f"python -m mjx_walk.compare {shlex.join([*words, f'seeds=[{seeds}]'])}"
 
 
 def _word(value: object) -> str:
