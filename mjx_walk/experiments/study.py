@@ -92,8 +92,6 @@ class TakenTrial:
     """A trial that this process works on."""
 
     trial: "optuna.Trial"
-    is_new: bool
-    """Whether it is new; otherwise its process has ended, and its training resumes."""
     lock: int
     """File descriptor that keeps other processes from taking it."""
     release: contextlib.ExitStack = dataclasses.field(repr=False)
@@ -224,7 +222,7 @@ class StudyFolder:
             for frozen in trials:
                 held = self._lock_trial(frozen.number) if frozen.state == TrialState.RUNNING else None
                 if held:
-                    return TakenTrial(Trial(study, frozen._trial_id), False, *held)
+                    return TakenTrial(Trial(study, frozen._trial_id), *held)
             begun = [frozen for frozen in trials if frozen.state != TrialState.WAITING]
             if len(begun) >= num_trials:
                 return None
@@ -236,7 +234,7 @@ class StudyFolder:
             trial = study.ask(fixed_distributions=ranges)
             held = self._lock_trial(trial.number)
             assert held, "nobody else knows this trial yet"
-            return TakenTrial(trial, True, *held)
+            return TakenTrial(trial, *held)
 
     def _lock_trial(self, number: int) -> tuple[int, contextlib.ExitStack] | None:
         """The lock of a trial, which the training process holds as well. None if it is taken."""
