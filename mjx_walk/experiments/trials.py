@@ -144,17 +144,13 @@ def run_trials(
     with Interrupt("the trials are saving") as interrupt:
         try:
             while not interrupt.signal_name:
-                while free:
-                    taken = tuning.take_trial(study)
-                    if taken is None:
-                        break
+                while free and (taken := tuning.take_trial(study)):
                     training = _start(tuning, study, taken, free[0], share)
                     if training:
                         running.append(training)
                         free.pop(0)
                     else:
-                        on_end(taken.trial.number)
-                        _stop_if_hopeless(study, tuning.folder)
+                        _has_ended(taken.trial.number, tuning, study, on_end)
                 if not running:
                     break
                 time.sleep(_SECONDS_BETWEEN_LOOKS)
@@ -165,8 +161,7 @@ def run_trials(
                         running.remove(training)
                         free.append(training.device)
                         _end(study, training.taken, training.job, training)
-                        on_end(training.taken.trial.number)
-                        _stop_if_hopeless(study, tuning.folder)
+                        _has_ended(training.taken.trial.number, tuning, study, on_end)
                 if time.monotonic() - last_report > _SECONDS_BETWEEN_REPORTS:
                     last_report = time.monotonic()
                     for run in itertools.chain.from_iterable(training.job for training in running):
@@ -257,10 +252,12 @@ def _fail(study: "optuna.Study", taken: TakenTrial, reason: str) -> None:
     taken.release.close()
 
 
-def _stop_if_hopeless(study: "optuna.Study", folder: StudyFolder) -> None:
-    """Stop if nothing but failures has ended."""
+def _has_ended(number: int, tuning: Tuning, study: "optuna.Study", on_end: Callable[[int], None]) -> None:
+    """Say that a trial has ended. Stop the study if nothing but failures has ended."""
     from optuna.trial import TrialState
 
+    on_end(number)
     ended = [trial.state for trial in study.get_trials(deepcopy=False) if trial.state.is_finished()]
     if len(ended) >= _FAILURES_TO_STOP and set(ended) == {TrialState.FAIL}:
-        raise UserError(f"the first {len(ended)} trials have all failed; remove {folder.path}, and correct the command")
+        folder = tuning.folder.path
+        raise UserError(f"the first {len(ended)} trials have all failed; remove {folder}, and correct the command")
