@@ -1,7 +1,7 @@
 """The settings that a study searches, with the values that it may try, and the recipe that it starts from."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -14,7 +14,7 @@ from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import has_effect
 from mjx_walk.utils.value_types import plain_type, with_whole_number
 
-__all__ = ["Choices", "Interval", "SearchSpace", "default_space", "read_space"]
+__all__ = ["Choices", "Interval", "SearchSpace", "Value", "default_space", "read_space"]
 
 _SCORING = "evaluation.gymnasium_episodes"
 _RESERVED = {
@@ -42,10 +42,11 @@ class Interval:
         text = f"interval({self.low:g},{self.high:g})"
         return f"tag({_LOG},{text})" if self.is_log else text
 
-    def find(self, value: Any) -> Value | None:
+    def find(self, value: object) -> Value | None:
         """The value itself if it lies in the interval, else None."""
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        return value if is_number and self.low <= value <= self.high else None
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return None
+        return value if self.low <= value <= self.high else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,13 +55,13 @@ class Choices:
 
     labels: tuple[Value, ...]
     """Numbers; other values as a command line has them."""
-    values: tuple[Any, ...] = dataclasses.field(repr=False)
+    values: tuple[object, ...] = dataclasses.field(repr=False)
     """The same values as `config.yaml` has them."""
 
     def __str__(self) -> str:
         return ",".join(map(str, self.labels))
 
-    def find(self, value: Any) -> Value | None:
+    def find(self, value: object) -> Value | None:
         """The label of a value, or None if it is not among the choices."""
         return next((label for label, own in zip(self.labels, self.values, strict=True) if own == value), None)
 
@@ -76,7 +77,7 @@ class SearchSpace:
     ranges: dict[str, Interval | Choices]
     """The values to try, by the full keys of their settings."""
 
-    def overrides(self, values: dict[str, Any]) -> list[str]:
+    def overrides(self, values: Mapping[str, Value]) -> list[str]:
         """The overrides of a trial.
 
         Args:

@@ -8,13 +8,13 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mjx_walk.experiments.job_logs import failure_reason
 from mjx_walk.experiments.planned_runs import PlannedRun, start_job
-from mjx_walk.experiments.search_space import SearchSpace
+from mjx_walk.experiments.search_space import SearchSpace, Value
 from mjx_walk.experiments.study import TICKS, StudyFolder, TakenTrial
 from mjx_walk.logs.metrics import Row, read_rows
 from mjx_walk.machine.signals import Interrupt
@@ -56,7 +56,7 @@ class Tuning:
         """See `StudyFolder.take_trial`."""
         return self.folder.take_trial(study, self.space, self.num_trials, self.sampler, self.pruner, self.seed)
 
-    def job(self, number: int, values: dict[str, Any]) -> list[PlannedRun]:
+    def job(self, number: int, values: Mapping[str, Value]) -> list[PlannedRun]:
         """The runs of a trial, one for each seed.
 
         Raises:
