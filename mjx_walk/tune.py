@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 from mjx_walk.cli import parsing
 from mjx_walk.experiments.planned_runs import PlannedRun
 from mjx_walk.experiments.search_space import read_space
-from mjx_walk.experiments.study import PRUNERS, SAMPLERS, StudyFolder, facts_of, require_optuna
-from mjx_walk.experiments.trials import Tuning, run_trials
+from mjx_walk.experiments.study import StudyFolder, facts_of, require_optuna
+from mjx_walk.experiments.suggestions import PRUNERS, SAMPLERS
+from mjx_walk.experiments.trials import Tuning, refuse_changed_files, run_trials
 from mjx_walk.experiments.tuning_report import ranked, summary, write_page, write_tables
 from mjx_walk.machine.devices import count_devices
 from mjx_walk.machine.nvidia import warn_of_unused_gpu
@@ -73,6 +74,9 @@ def main(command_line: list[str]) -> int:
     if arguments.draw:
         if arguments.out is None:
             raise UserError("say which study to draw: out=DIR")
+        others = [word for word in command_line if word.partition("=")[0] not in ("draw", "out")]
+        if others:
+            raise UserError(f"'{others[0]}' has no effect with draw=true; leave it out")
         require_optuna()
         return _write_report(StudyFolder(user_path(arguments.out)))
     seeds = parsing.read_seeds(arguments.seeds)
@@ -86,12 +90,15 @@ def main(command_line: list[str]) -> int:
     require_optuna()
     env, algo = space.recipe.env.name, space.recipe.algo.name
     folder = StudyFolder(user_path(arguments.out or f"runs/tune_{env}_{algo}"))
+    if "," in str(folder.path):  # compare takes several recipes with commas between them
+        raise UserError(f"out={folder.path}: choose a name without a comma")
     study = folder.create_or_open(facts_of(space, seeds))
     ended = sum(trial.state.is_finished() for trial in study.get_trials(deepcopy=False))
-    print(f"{arguments.trials} trials in {folder.path}, {ended} of them have ended already", flush=True)
+    print(f"A study of {arguments.trials} trials in {folder.path}, of which {ended} ended before", flush=True)
     for key, values in space.ranges.items():
         outside = "" if key in space.recipe_values else f"; the recipe's own lies outside: {flatten(space.recipe)[key]}"
         print(f"  {key}={values}{outside}", flush=True)
+    refuse_changed_files(folder, space, seeds)
     tuning = Tuning(folder, space, seeds, arguments.trials, arguments.sampler, arguments.pruner, arguments.seed)
     slots: list[int | None] = list(range(count)) if hardware == "gpu" else [None]
     on_end = functools.partial(_on_end, folder, study)
@@ -113,7 +120,7 @@ def _on_end(folder: StudyFolder, study: "optuna.Study", number: int) -> None:
     leader = f", best {format_score(best[0].value)} by trial {best[0].number}" if best else ""
     reason = trial.user_attrs.get("reason")
     result = f"failed: {reason}" if reason else f"{trial.state.name.lower()}, {format_score(trial.value)}{leader}"
-    print(f"trial {number}: {result}; {values}", flush=True)
+    print(f"trial {number}: {result}{values and f'; {values}'}", flush=True)
     write_tables(folder, study)
 
 
@@ -123,7 +130,7 @@ def _write_report(folder: StudyFolder) -> int:
     write_tables(folder, study)
     page = write_page(folder, study)
     print(summary(folder, study))
-    print(f"Written: {page}, trials.csv, and the best trials as recipes")
+    print(f"Written: {page}, trials.csv{', and the best trials as recipes' if ranked(study) else ''}")
     return 0 if ranked(study) else 1
 
 

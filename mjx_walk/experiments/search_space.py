@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import IntervalSweep, Override
+from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, RangeSweep
 
 from mjx_walk.settings.config import Config, flatten, load_config
 from mjx_walk.settings.overrides import complete_overrides, sweep_choices
@@ -39,7 +39,7 @@ class Interval:
     is_int: bool
 
     def __str__(self) -> str:
-        text = f"interval({self.low:g},{self.high:g})"
+        text = f"interval({self.low:.12g},{self.high:.12g})"
         return f"tag({_LOG},{text})" if self.is_log else text
 
     def find(self, value: object) -> Value | None:
@@ -158,8 +158,12 @@ def _multiples(value: float, factors: Iterable[float]) -> str:
 def _split(completed: list[str]) -> tuple[list[str], list[Override]]:
     """The fixed overrides, and those that give several values."""
     fixed, searched = [], []
+    keys: set[str] = set()
     for override in OverridesParser.create().parse_overrides(completed):
         key, text = override.key_or_group, str(override.input_line)
+        if key in keys:
+            raise UserError(f"'{text}': {key} is given twice")
+        keys.add(key)
         if key in _RESERVED:
             raise UserError(f"'{text}': in a study {_RESERVED[key].format(text.partition('=')[2])}")
         if not override.is_sweep_override():
@@ -177,6 +181,8 @@ def _texts(override: Override) -> list[str]:
     """The values of an override that are checked: all of them, or both ends of an interval."""
     sweep, text = override.value(), override.input_line
     if not isinstance(sweep, IntervalSweep):
+        if isinstance(sweep, ChoiceSweep | RangeSweep) and sweep.shuffle:
+            raise UserError(f"{text}: leave shuffle out; the sampler chooses the order")
         choices = [choice.partition("=")[2] for choice in sweep_choices(override)]
         if len(choices) < 2:
             raise UserError(f"{text}: give several values, or one without a function")

@@ -2,17 +2,14 @@
 
 import contextlib
 import dataclasses
-import importlib
 import time
 import typing
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from mjx_walk.experiments.search_space import Choices, Interval, SearchSpace
+from mjx_walk.experiments.search_space import SearchSpace
+from mjx_walk.experiments.suggestions import make_pruner, make_sampler, with_values
 from mjx_walk.settings.config import flatten, load_config
 from mjx_walk.settings.recipe_files import recipe_file
 from mjx_walk.settings.saved_config import in_short
@@ -23,18 +20,13 @@ from mjx_walk.utils.errors import UserError, first_line
 if TYPE_CHECKING:
     import optuna
 
-__all__ = ["PRUNERS", "SAMPLERS", "TICKS", "Facts", "StudyFolder", "TakenTrial", "facts_of", "require_optuna"]
+__all__ = ["Facts", "StudyFolder", "TakenTrial", "facts_of", "require_optuna"]
 
-TICKS = 20
-"""Equal parts of a training. After each of them, a trial reports a value, and may be pruned."""
-SAMPLERS = ("tpe", "random")
-PRUNERS = ("median", "halving", "hyperband", "none")
 _NAME = "mjx_walk"
 """Name of the study, and of the attribute that holds its facts."""
 _CHOOSE_RECIPE = ("hardware", "env", "env.task", "algo", "recipe")
 _OF_A_TRIAL = ("run_dir", "resume", "evaluation.gymnasium_episodes")
 """Settings of trials that no recipe has."""
-_TRIALS_WITHOUT_PRUNING = 5
 _BUSY = "in use"
 
 
@@ -79,6 +71,7 @@ def facts_of(space: SearchSpace, seeds: list[int]) -> Facts:
     given = dict(text.split("=", 1) for text in space.fixed)
     env, algo = space.recipe.env.name, space.recipe.algo.name
     chosen = [f"env.task={space.recipe.env.task}" if "env.task" in given else f"env={env}", f"algo={algo}"]
+    chosen += [f"hardware={space.recipe.hardware}"] if "hardware" in given else []
     choosing = [text for text in space.fixed if text.partition("=")[0] in _CHOOSE_RECIPE]
     plain, settings = flatten(load_config(choosing)), flatten(space.recipe)
     changes = {key: value for key, value in settings.items() if value != plain.get(key) and key not in _OF_A_TRIAL}
@@ -144,11 +137,30 @@ class StudyFolder:
         except OSError as error:
             raise UserError(f"cannot write to {self.path}: {error.strerror}; choose another out=DIR") from error
         with self._alone():
+            self._mend()
             study = self._load(create=True)
             if _NAME not in study.user_attrs:
                 study.set_user_attr(_NAME, dataclasses.asdict(facts))
         _refuse_other(self.facts(study), facts, self.path)
         return study
+
+    def _mend(self) -> None:
+        """Remove a last line that a full disk has left incomplete. Optuna would append to it."""
+        from optuna.storages.journal import JournalFileOpenLock
+
+        refuse_links(self.storage, self.path)
+        if not self.storage.is_file():
+            return
+        lock = JournalFileOpenLock(str(self.storage))
+        lock.acquire()
+        try:
+            with self.storage.open("rb+") as file:
+                content = file.read()
+                file.truncate(content.rfind(b"\n") + 1)
+        except OSError as error:
+            raise UserError(f"cannot read or write {self.storage}: {error.strerror}") from error
+        finally:
+            lock.release()
 
     def _load(self, create: bool) -> "optuna.Study":
         from optuna import create_study, load_study
@@ -206,8 +218,8 @@ class StudyFolder:
             study: the study.
             space: what it searches.
             num_trials: trials of the complete study.
-            sampler: one of `SAMPLERS`.
-            pruner: one of `PRUNERS`.
+            sampler: one of `suggestions.SAMPLERS`.
+            pruner: one of `suggestions.PRUNERS`.
             seed: with the trial's number, the seed of the sampler.
 
         Returns:
@@ -216,25 +228,27 @@ class StudyFolder:
         from optuna import Trial
         from optuna.trial import TrialState
 
-        study.pruner = _pruner(pruner)
+        study.pruner = make_pruner(pruner)
         with self._alone():
             trials = study.get_trials(deepcopy=False)
             for frozen in trials:
                 held = self._lock_trial(frozen.number) if frozen.state == TrialState.RUNNING else None
-                if held:
-                    return TakenTrial(Trial(study, frozen._trial_id), *held)
+                if not held:
+                    continue
+                if study.get_trials(deepcopy=False)[frozen.number].state == TrialState.RUNNING:
+                    study.sampler = make_sampler(sampler, seed, frozen.number)
+                    return TakenTrial(with_values(Trial(study, frozen._trial_id), space), *held)
+                held[1].close()  # it has ended since the trials were read
             begun = [frozen for frozen in trials if frozen.state != TrialState.WAITING]
             if len(begun) >= num_trials:
                 return None
-            study.sampler = _sampler(sampler, seed, len(begun))
-            ranges = {key: _distribution(values) for key, values in space.ranges.items()}
+            study.sampler = make_sampler(sampler, seed, len(begun))
             if not begun:
                 study.enqueue_trial(space.recipe_values, skip_if_exists=True)
-                ranges = {key: ranges[key] for key in space.recipe_values}
-            trial = study.ask(fixed_distributions=ranges)
+            trial = study.ask()
             held = self._lock_trial(trial.number)
             assert held, "nobody else knows this trial yet"
-            return TakenTrial(trial, *held)
+            return TakenTrial(with_values(trial, space), *held)
 
     def _lock_trial(self, number: int) -> tuple[int, contextlib.ExitStack] | None:
         """The lock of a trial, which the training process holds as well. None if it is taken."""
@@ -259,35 +273,3 @@ def _refuse_other(saved: Facts, asked: Facts, folder: Path) -> None:
     ]
     if differing:
         raise UserError(f"{folder} holds a study with other settings ({in_short(differing)}); choose another out=DIR")
-
-
-def _distribution(values: Interval | Choices) -> "optuna.distributions.BaseDistribution":
-    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
-
-    if isinstance(values, Choices):
-        return CategoricalDistribution(values.labels)
-    if values.is_int:
-        return IntDistribution(int(values.low), int(values.high), log=values.is_log)
-    return FloatDistribution(values.low, values.high, log=values.is_log)
-
-
-def _sampler(name: str, seed: int, number: int) -> "optuna.samplers.BaseSampler":
-    """A sampler for one trial. Its seed depends on the trial's number, so that a resumed study repeats no trial."""
-    samplers = importlib.import_module("optuna.samplers")
-    own_seed = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-    return {"tpe": samplers.TPESampler, "random": samplers.RandomSampler}[name](seed=own_seed)
-
-
-def _pruner(name: str) -> "optuna.pruners.BasePruner":
-    """One of `PRUNERS`, for `TICKS` values of each trial."""
-    from optuna import pruners
-
-    if name == "median":
-        return pruners.MedianPruner(n_startup_trials=_TRIALS_WITHOUT_PRUNING, n_warmup_steps=TICKS // 4)
-    if name == "halving":
-        return pruners.SuccessiveHalvingPruner(min_resource=TICKS // 10, reduction_factor=3)
-    if name == "hyperband":
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return pruners.HyperbandPruner(min_resource=TICKS // 10, max_resource=TICKS, reduction_factor=3)
-    return pruners.NopPruner()

@@ -1,6 +1,5 @@
 """The trials of a study: each one is a training in a process of its own, whose evaluations Optuna gets as they end."""
 
-import bisect
 import contextlib
 import dataclasses
 import itertools
@@ -15,25 +14,33 @@ from typing import TYPE_CHECKING
 from mjx_walk.experiments.job_logs import failure_reason
 from mjx_walk.experiments.planned_runs import PlannedRun, start_job
 from mjx_walk.experiments.search_space import SearchSpace, Value
-from mjx_walk.experiments.study import TICKS, StudyFolder, TakenTrial
-from mjx_walk.logs.metrics import Row, read_rows
+from mjx_walk.experiments.study import StudyFolder, TakenTrial
+from mjx_walk.experiments.suggestions import TICKS
+from mjx_walk.experiments.trial_values import value_at
+from mjx_walk.logs.metrics import read_rows
 from mjx_walk.machine.signals import Interrupt
 from mjx_walk.settings.config import load_config
+from mjx_walk.settings.input_files import changed_input
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.files import check_replaceable, refuse_links
+from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.utils.errors import UserError
 
 if TYPE_CHECKING:
     import optuna
 
-__all__ = ["NUM_EVALUATIONS", "Tuning", "run_trials", "value_at"]
+__all__ = ["Tuning", "refuse_changed_files", "run_trials"]
 
-NUM_EVALUATIONS = 3
-"""Newest evaluations during training whose mean is the value of a trial."""
 _SECONDS_BETWEEN_LOOKS = 1.0
 _SECONDS_BETWEEN_REPORTS = 30.0
 _FAILURES_TO_STOP = 3
 """A study ends when its first trials all fail."""
+_BY_SIGNAL = tuple(
+    code for number in (signal.SIGINT, signal.SIGKILL, signal.SIGTERM) for code in (int(number), 128 + int(number))
+)
+"""Absolute values of the exit codes of a training that somebody has ended, or the system for want of memory."""
+_MOST_INTERRUPTIONS = 2
+"""Such ends after which a trial resumes. The next one fails it."""
 _ADVICE = "so try a smaller num_envs or per_device=1"
 
 
@@ -85,34 +92,16 @@ class _Training:
     is_pruned: bool = False
 
 
-def value_at(logs: list[list[Row]], total_steps: int, tick: int = TICKS) -> float | None:
-    """The value of a trial after a part of its training.
+def refuse_changed_files(folder: StudyFolder, space: SearchSpace, seeds: list[int]) -> None:
+    """Check that the user's files are those of the trials so far.
 
-    It is the mean over seeds of the mean of the last `NUM_EVALUATIONS` evaluations. Those of untrained policies do not
-    count.
-
-    Args:
-        logs: rows of `metrics.jsonl` of each seed.
-        total_steps: environment steps of the complete training.
-        tick: number of parts of the training, from 1 to `TICKS`.
-
-    Returns:
-        The value, or None if a seed has not come that far or has no evaluation.
+    Raises:
+        UserError: one has changed.
     """
-    means = []
-    for rows in logs:
-        index = bisect.bisect_left([row["env_steps"] * TICKS for row in rows], tick * total_steps)
-        if index == len(rows):
-            return None
-        evaluations = [row["eval/return"] for row in rows[: index + 1] if _is_evaluated(row)][-NUM_EVALUATIONS:]
-        if not evaluations:
-            return None
-        means.append(sum(evaluations) / len(evaluations))
-    return sum(means) / len(means)
-
-
-def _is_evaluated(row: Row) -> bool:
-    return row.get("eval/return") is not None and (row.get("eval/env_steps") or 0) > 0
+    for run in (RunFolder(folder.trial_folder(0) / f"seed_{seed}") for seed in seeds):
+        changed = changed_input(run, space.recipe.env)
+        if changed:
+            raise UserError(f"{changed} has changed since the study in {folder.path} began; choose another out=DIR")
 
 
 def run_trials(
@@ -150,18 +139,18 @@ def run_trials(
                         running.append(training)
                         free.pop(0)
                     else:
-                        _has_ended(taken.trial.number, tuning, study, on_end)
+                        _has_ended(taken.trial.number, tuning, study, on_end, running)
                 if not running:
                     break
                 time.sleep(_SECONDS_BETWEEN_LOOKS)
                 for training in list(running):
                     has_ended = training.process.poll() is not None  # asked first: all that it wrote is read then
-                    _report(training)
+                    _report(training, has_ended)
                     if has_ended:
                         running.remove(training)
                         free.append(training.device)
                         _end(study, training.taken, training.job, training)
-                        _has_ended(training.taken.trial.number, tuning, study, on_end)
+                        _has_ended(training.taken.trial.number, tuning, study, on_end, running)
                 if time.monotonic() - last_report > _SECONDS_BETWEEN_REPORTS:
                     last_report = time.monotonic()
                     for run in itertools.chain.from_iterable(training.job for training in running):
@@ -171,6 +160,8 @@ def run_trials(
                 training.process.send_signal(signal.SIGTERM)
             for training in running:
                 training.process.wait()
+                if training.is_pruned:
+                    _end(study, training.taken, training.job, training)
                 training.taken.release.close()
     return interrupt.signal_name
 
@@ -191,13 +182,13 @@ def _start(
         job.sort(key=lambda run: run.steps_saved or 0)  # if one of them has saved nothing, all begin again
         process = start_job(job, log, device, share, taken.lock, ends_with_parent=True)
     except UserError as error:
-        _fail(study, taken, str(error))
+        _fail(study, taken, job, str(error))
         return None
     reported = set(study.get_trials(deepcopy=False)[trial.number].intermediate_values)
     return _Training(taken, job, process, log, device, reported)
 
 
-def _report(training: _Training) -> None:
+def _report(training: _Training, has_ended: bool) -> None:
     """Report the evaluations that are new, and stop a trial that is to be pruned. The recipe's own is never pruned."""
     files = [run.folder.metrics for run in training.job]
     num_bytes = sum(file.stat().st_size for file in files if file.exists())
@@ -211,7 +202,8 @@ def _report(training: _Training) -> None:
             continue
         trial.report(value, tick)
         training.reported.add(tick)
-        if tick < TICKS and trial.number > 0 and trial.should_prune():
+        is_bad = trial.should_prune()  # asked for the recipe, too: others are compared with it
+        if is_bad and trial.number > 0 and not has_ended:
             training.is_pruned = True
             training.process.send_signal(signal.SIGTERM)
             return
@@ -221,43 +213,65 @@ def _end(study: "optuna.Study", taken: TakenTrial, job: list[PlannedRun], traini
     """Tell Optuna how a trial has ended, and remove what only a resume needs."""
     from optuna.trial import TrialState
 
-    value = value_at([read_rows(run.folder.metrics) for run in job], job[0].config.total_steps)
-    if training and training.is_pruned:
-        study.tell(taken.trial, state=TrialState.PRUNED)
-    elif not all(run.is_finished for run in job):
+    trial, logs = taken.trial, [read_rows(run.folder.metrics) for run in job]
+    value = value_at(logs, job[0].config.total_steps)
+    seconds = [rows[-1]["wall_seconds"] for rows in logs if rows]
+    if seconds:
+        trial.set_user_attr("seconds", max(seconds))
+    if all(run.is_finished for run in job):
+        if value is None:
+            steps = job[0].config.total_steps
+            _fail(study, taken, job, f"no evaluation of a trained policy ended within total_steps={steps}; raise it")
+            return
+        study.tell(trial, value)
+    elif training and training.is_pruned:
+        study.tell(trial, state=TrialState.PRUNED)
+    else:
         assert training
-        code = training.process.returncode
+        code, interruptions = training.process.returncode, trial.user_attrs.get("interruptions", 0)
+        if abs(code) in _BY_SIGNAL and interruptions < _MOST_INTERRUPTIONS:
+            trial.set_user_attr("interruptions", interruptions + 1)
+            taken.release.close()  # the next look finds it without a process, and resumes it
+            return
         by_signal = f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         reason = failure_reason(training.log, _ADVICE) or by_signal
-        _fail(study, taken, f"{reason}; see {training.log}")
+        _fail(study, taken, job, f"{reason}; see {training.log}")
         return
-    elif value is None:
-        steps = job[0].config.total_steps
-        _fail(study, taken, f"no evaluation of a trained policy ended within total_steps={steps}; raise it")
-        return
-    else:
-        study.tell(taken.trial, value)
+    _remove_checkpoints(job)
+    taken.release.close()
+
+
+def _remove_checkpoints(job: list[PlannedRun]) -> None:
+    """Remove what only a resume needs. The kept policies stay."""
     for run in job:
         for path in checkpoint.list_steps(run.folder.checkpoints):
             with contextlib.suppress(OSError):
                 shutil.rmtree(path)
-    taken.release.close()
 
 
-def _fail(study: "optuna.Study", taken: TakenTrial, reason: str) -> None:
+def _fail(study: "optuna.Study", taken: TakenTrial, job: list[PlannedRun], reason: str) -> None:
     from optuna.trial import TrialState
 
     taken.trial.set_user_attr("reason", reason)
     study.tell(taken.trial, state=TrialState.FAIL)
+    _remove_checkpoints(job)
     taken.release.close()
 
 
-def _has_ended(number: int, tuning: Tuning, study: "optuna.Study", on_end: Callable[[int], None]) -> None:
-    """Say that a trial has ended. Stop the study if nothing but failures has ended."""
+def _has_ended(
+    number: int,
+    tuning: Tuning,
+    study: "optuna.Study",
+    on_end: Callable[[int], None],
+    running: list[_Training],
+) -> None:
+    """Say that a trial has ended. Stop the study if nothing but failures has ended and nothing else is running."""
     from optuna.trial import TrialState
 
+    if not study.get_trials(deepcopy=False)[number].state.is_finished():
+        return  # it was interrupted, and resumes
     on_end(number)
     ended = [trial.state for trial in study.get_trials(deepcopy=False) if trial.state.is_finished()]
-    if len(ended) >= _FAILURES_TO_STOP and set(ended) == {TrialState.FAIL}:
+    if not running and len(ended) >= _FAILURES_TO_STOP and set(ended) == {TrialState.FAIL}:
         folder = tuning.folder.path
         raise UserError(f"the first {len(ended)} trials have all failed; remove {folder}, and correct the command")

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from mjx_walk.algos import BUILT_IN_ALGORITHMS
 from mjx_walk.envs import BUILT_IN_TASKS
 from mjx_walk.experiments.study import Facts, StudyFolder
-from mjx_walk.experiments.trials import NUM_EVALUATIONS
+from mjx_walk.experiments.trial_values import NUM_EVALUATIONS
 from mjx_walk.logs.metrics import write_csv
 from mjx_walk.storage.files import write_text
 from mjx_walk.utils.errors import UserError
@@ -96,10 +96,18 @@ def write_tables(folder: StudyFolder, study: "optuna.Study") -> None:
         write_csv(
             [_row(folder, facts, trial) for trial in study.get_trials(deepcopy=False)], folder.path / "trials.csv"
         )
-        for path, trial in zip(_recipe_files(folder), ranked(study), strict=False):
+        for path, trial in zip(_recipe_files(folder), _distinct(study), strict=False):
             write_text(path, _recipe(facts, trial))
     except OSError as error:
         raise UserError(f"cannot write to {folder.path}: {error.strerror}") from error
+
+
+def _distinct(study: "optuna.Study") -> list["optuna.trial.FrozenTrial"]:
+    """The best complete trials whose values differ."""
+    found: dict[str, optuna.trial.FrozenTrial] = {}
+    for trial in ranked(study):
+        found.setdefault(str(sorted(trial.params.items())), trial)
+    return list(found.values())[:_NUM_RECIPES]
 
 
 def _recipe_files(folder: StudyFolder) -> list[Path]:
@@ -114,7 +122,7 @@ def _row(folder: StudyFolder, facts: Facts, trial: "optuna.trial.FrozenTrial") -
         "state": trial.state.name.lower(),
         "value": trial.value,
         **{key: str(value) for key, value in (own | trial.params).items()},
-        "seconds": trial.duration.total_seconds() if trial.duration else None,
+        "seconds": trial.user_attrs.get("seconds"),
         "reason": trial.user_attrs.get("reason"),
         "folder": str(folder.trial_folder(trial.number)),
     }
@@ -128,8 +136,9 @@ def _recipe(facts: Facts, trial: "optuna.trial.FrozenTrial") -> str:
     defaults += [{"override /env": env}] if env in BUILT_IN_TASKS else []
     defaults += [{"override /algo": algo}] if algo in BUILT_IN_ALGORITHMS else []
     node = OmegaConf.create({"defaults": [*defaults, "_self_"]})
-    for key, value in {**facts.changes, **trial.params}.items():
-        OmegaConf.update(node, key, yaml.safe_load(value) if isinstance(value, str) else value)
+    found = {key: yaml.safe_load(value) if isinstance(value, str) else value for key, value in trial.params.items()}
+    for key, value in (facts.changes | found).items():
+        OmegaConf.update(node, key, value)
     first = f"# Trial {trial.number}, seeds {facts.seeds}: {format_score(trial.value)}, the {_VALUE}.\n"
     return printable(first.rstrip()) + "\n" + OmegaConf.to_yaml(node)
 
@@ -146,13 +155,14 @@ def summary(folder: StudyFolder, study: "optuna.Study") -> str:
         return lines[0]
     own = next((trial for trial in best if trial.number == 0), None)
     lines.append(f"Best: {format_score(best[0].value)} by trial {best[0].number}. Values are the {_VALUE}.")
+    if own is best[0]:
+        return "\n".join(map(printable, [*lines, "This is the recipe with your settings. No trial beats it: keep it."]))
     if own:
-        found = "no trial beats it" if own is best[0] else "as trial 0"
-        lines.append(f"The recipe {facts.recipe}: {format_score(own.value)}, {found}.")
+        lines.append(f"The recipe with your settings, trial 0: {format_score(own.value)}.")
     lines += [f"  {key}={value}" for key, value in best[0].params.items()]
     lines += ["", "Train with the best:", f"  {_train_command(folder, facts)}"]
     lines += ["One seed is no result. Compare the best trials with the recipe on fresh seeds:"]
-    lines += [f"  {_compare_command(folder, facts, min(len(best), _NUM_RECIPES))}"]
+    lines += [f"  {_compare_command(folder, facts, len(_distinct(study)))}"]
     return "\n".join(map(printable, lines))
 
 
