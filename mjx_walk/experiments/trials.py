@@ -146,7 +146,7 @@ def run_trials(
                 for training in list(running):
                     has_ended = training.process.poll() is not None  # asked first: all that it wrote is read then
                     _report(training, has_ended)
-                    if has_ended:
+                    if has_ended and not interrupt.signal_name:  # the signal may have ended it, too: it resumes
                         running.remove(training)
                         free.append(training.device)
                         _end(study, training.taken, training.job, training)
