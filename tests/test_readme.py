@@ -48,7 +48,7 @@ PROGRAMS = {
     "in_brax.py": "",
     "in_gymnax.py": "",
     "with_another_id.py": "",
-    "read_data.py": r"\[.* 0\.\d+\] \d+",
+    "read_data.py": r"\[.* 0\.\d+ *\] \d+",
     "train_sb3.py": "",
     "in_torch.py": "",
     "train_many_sb3.py": "",

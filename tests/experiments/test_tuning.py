@@ -27,7 +27,7 @@ SHORT = (
     *("env=inverted_pendulum", "algo=a2c", "env.max_episode_steps=40", "num_envs=8", "iterations_per_call=2"),
     *("algo.unroll_length=8", "algo.num_minibatches=2", "algo.normalizer_warmup_steps_per_env=8"),
     *("algo.policy_hidden_layer_sizes=[8]", "algo.value_hidden_layer_sizes=[8]", "evaluation.num_envs=2"),
-    *("checkpoint.every_calls=4", "algo.learning_rate_schedule=constant", "algo.learning_rate=1e-3,3e-2,1e30"),
+    *("checkpoint.every_calls=4", "algo.learning_rate_schedule=constant", "algo.learning_rate=1e-4,3e-2,1e30"),
 )
 """A study whose trials take as long as their start. With the last learning rate, they end in NaN."""
 
@@ -258,7 +258,7 @@ def test_a_study_of_ten_short_trials(tmp_path, monkeypatch, capfd, optuna):
     assert yaml.safe_load(Path("out/best.yaml").read_text())["algo"]["learning_rate"] == best["algo.learning_rate"]
     assert command_here("train", "recipe=out/best.yaml", "total_steps=1", "evaluation.gymnasium_episodes=0") == 0
     assert command_here("tune", *arguments) == 0
-    assert "10 trials in out, 10 of them have ended already" in capfd.readouterr().out
+    assert "A study of 10 trials in out, of which 10 ended before" in capfd.readouterr().out
 
 
 @pytest.mark.slow
