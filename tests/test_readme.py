@@ -37,7 +37,7 @@ from mjx_walk.training.trainer import Trainer
 
 RESULTS = (CLONE / "docs" / "results.md").read_text()
 CHANGE_A_TASK = (CLONE / "docs" / "change_a_task.md").read_text()
-RUN_ELSEWHERE = ("bench", "parity", "compare suite=")
+RUN_ELSEWHERE = ("bench", "parity", "compare suite=", "export run=zoo:humanoid-csac format=hub")
 """Commands that tests of their own run, at sizes of their own."""
 
 

@@ -262,6 +262,7 @@ def test_a_study_of_ten_short_trials(tmp_path, monkeypatch, capfd, optuna):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_study_that_only_fails_ends(tmp_path, monkeypatch, capfd, optuna):
     """Seven environments cannot be split into minibatches."""
     monkeypatch.chdir(tmp_path)
