@@ -15,9 +15,8 @@ from mjx_walk.experiments import planned_runs
 from mjx_walk.experiments.job_logs import failure_reason
 from mjx_walk.experiments.planned_runs import PlannedRun
 from mjx_walk.experiments.report import write_report
+from mjx_walk.experiments.slots import find_slots
 from mjx_walk.experiments.suite import SUITES, plan_suite
-from mjx_walk.machine.devices import count_devices
-from mjx_walk.machine.nvidia import warn_of_unused_gpu
 from mjx_walk.machine.signals import exit_code
 from mjx_walk.settings.config import Config
 from mjx_walk.settings.overrides import key_of_value
@@ -73,18 +72,11 @@ def main(command_line: list[str]) -> int:
     if arguments.out is not None and user_path(arguments.out).is_file():
         raise UserError(f"out={arguments.out} is a file; give a folder")
     seeds = parsing.read_seeds(arguments.seeds)
-    hardware, available = count_devices()
-    if hardware == "cpu":
-        warn_of_unused_gpu()
-    count = arguments.devices or available
-    if count > available:
-        raise UserError(f"devices={count}: this machine has {available}; leave it out to use all")
+    hardware, slots = find_slots(arguments.devices, arguments.per_device)
     options = (overrides, list(arguments.algos), seeds, arguments.out, hardware)
     out, planned = plan_suite(arguments.suite, *options) if arguments.suite else planned_runs.plan(*options)
     unfinished = [run for run in planned if not run.is_finished]
     print(f"{len(planned)} runs in {out}, {len(planned) - len(unfinished)} of them finished already", flush=True)
-    slots: list[int | None] = list(range(count)) if hardware == "gpu" else [None]
-    slots *= arguments.per_device
     # On an H200, three seeds of PPO train in 405 s together and in 486 s in turn. On two cores, sharing gains nothing.
     default = planned_runs.most_together(unfinished, len(slots)) if hardware == "gpu" else 1
     jobs = planned_runs.jobs(unfinished, arguments.together or default)

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 from mjx_walk.cli import parsing
 from mjx_walk.experiments.planned_runs import PlannedRun
 from mjx_walk.experiments.search_space import read_space
+from mjx_walk.experiments.slots import find_slots
 from mjx_walk.experiments.study import StudyFolder, facts_of, require_optuna
 from mjx_walk.experiments.suggestions import PRUNERS, SAMPLERS
 from mjx_walk.experiments.trials import Tuning, refuse_changed_files, run_trials
 from mjx_walk.experiments.tuning_report import ranked, summary, write_page, write_tables
-from mjx_walk.machine.devices import count_devices
-from mjx_walk.machine.nvidia import warn_of_unused_gpu
 from mjx_walk.machine.signals import exit_code
 from mjx_walk.settings.config import Config, flatten
 from mjx_walk.settings.overrides import key_of_value
@@ -80,12 +79,7 @@ def main(command_line: list[str]) -> int:
         require_optuna()
         return _write_report(StudyFolder(user_path(arguments.out)))
     seeds = parsing.read_seeds(arguments.seeds)
-    hardware, available = count_devices()
-    if hardware == "cpu":
-        warn_of_unused_gpu()
-    count = arguments.devices or available
-    if count > available:
-        raise UserError(f"devices={count}: this machine has {available}; leave it out to use all")
+    hardware, slots = find_slots(arguments.devices, arguments.per_device)
     space = read_space(overrides, hardware, arguments.default_ranges)
     require_optuna()
     env, algo = space.recipe.env.name, space.recipe.algo.name
@@ -100,9 +94,8 @@ def main(command_line: list[str]) -> int:
         print(f"  {key}={values}{outside}", flush=True)
     refuse_changed_files(folder, space, seeds)
     tuning = Tuning(folder, space, seeds, arguments.trials, arguments.sampler, arguments.pruner, arguments.seed)
-    slots: list[int | None] = list(range(count)) if hardware == "gpu" else [None]
     on_end = functools.partial(_on_end, folder, study)
-    signal_name = run_trials(tuning, study, slots * arguments.per_device, on_end, _on_progress)
+    signal_name = run_trials(tuning, study, slots, on_end, _on_progress)
     if signal_name:
         print(f"Stopped by {signal_name}. Run the same command to continue.")
         return exit_code(signal_name)

@@ -14,10 +14,11 @@ import pytest
 from helpers import OLD_RUNS, renders
 
 import mjx_walk
-from mjx_walk import compare, play, tune, zoo
+from mjx_walk import compare, play, zoo
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.cli import parsing
 from mjx_walk.envs import GYMNASIUM_TASKS, TASKS
+from mjx_walk.experiments import slots
 from mjx_walk.settings.config import load_config
 from mjx_walk.training import launcher
 from mjx_walk.utils.errors import UserError
@@ -75,7 +76,7 @@ def files(folder, monkeypatch):
     monkeypatch.chdir(folder)
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    for module in (compare, launcher, tune):  # asks another process
+    for module in (launcher, slots):  # asks another process
         monkeypatch.setattr(module, "count_devices", lambda: ("cpu", 1))
     before = sorted(folder.rglob("*"))
     yield folder

@@ -19,6 +19,7 @@ from mjx_walk.experiments.trial_values import NUM_EVALUATIONS
 from mjx_walk.logs.metrics import write_csv
 from mjx_walk.storage.files import write_text
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.setting_fields import in_yaml
 from mjx_walk.utils.text import format_score, printable
 from mjx_walk.viewing.figures import standard_style
 
@@ -175,16 +176,9 @@ def _compare_command(folder: StudyFolder, facts: Facts, num_recipes: int) -> str
     files = [facts.recipe, *map(str, _recipe_files(folder)[:num_recipes])]
     words = [word for word in facts.chosen if not word.startswith("algo=")]
     words += [f"algos=[{facts.settings['algo.name']}]", f"recipe={','.join(files)}"]
-    words += [f"{key}={_word(value)}" for key, value in facts.changes.items()]
+    words += [f"{key}={in_yaml(value)}" for key, value in facts.changes.items()]
     seeds = ",".join(map(str, range(first, first + _NUM_SEEDS)))
     return f"python -m mjx_walk.compare {shlex.join([*words, f'seeds=[{seeds}]'])}"
-
-
-def _word(value: object) -> str:
-    """A value as a command line has it."""
-    if isinstance(value, list):
-        return f"[{','.join(map(_word, value))}]"
-    return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))
 
 
 def write_page(folder: StudyFolder, study: "optuna.Study") -> Path:

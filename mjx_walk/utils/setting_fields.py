@@ -20,6 +20,7 @@ __all__ = [
     "Row",
     "describe",
     "has_effect",
+    "in_yaml",
     "meanings",
     "refuse_ineffective",
     "setting",
@@ -151,9 +152,9 @@ def refuse_ineffective(config: object, keys: Iterable[str]) -> None:
         if blockers is None:
             continue
         values = {key.removesuffix(name) + other: getattr(owner, other) for other in blockers}
-        reason = " and ".join(f"{other}={_as_yaml(value)}" for other, value in values.items())
+        reason = " and ".join(f"{other}={in_yaml(value)}" for other, value in values.items())
         reason = f"with {reason}; change that, or" if reason else "here;"
-        raise UserError(f"{key}={_as_yaml(getattr(owner, name))} has no effect {reason} leave it out")
+        raise UserError(f"{key}={in_yaml(getattr(owner, name))} has no effect {reason} leave it out")
 
 
 def has_effect(config: object, key: str) -> bool:
@@ -220,7 +221,7 @@ def table(schema: type) -> list[Row]:
         if is_group or conditions == {} or len(field.metadata.get("choices", "ab")) == 1:
             continue
         condition = _as_text(conditions) if conditions else ""
-        rows.append(Row(field.name, _as_yaml(field.default), _range(field.metadata), condition))
+        rows.append(Row(field.name, in_yaml(field.default), _range(field.metadata), condition))
     return rows
 
 
@@ -264,13 +265,14 @@ def _range(limits: Mapping[str, Any]) -> str:
 
 def _as_text(conditions: dict[str, object]) -> str:
     alternatives = [
-        f"{other} other than {_as_yaml(wanted.value)}" if isinstance(wanted, AnyBut) else f"{other}={_as_yaml(wanted)}"
+        f"{other} other than {in_yaml(wanted.value)}" if isinstance(wanted, AnyBut) else f"{other}={in_yaml(wanted)}"
         for other, wanted in conditions.items()
     ]
     return " or ".join(alternatives)
 
 
-def _as_yaml(value: object) -> str:
+def in_yaml(value: object) -> str:
+    """A value as a command line and a table of settings have it."""
     if isinstance(value, list | tuple):
-        return f"[{','.join(map(_as_yaml, value))}]"
+        return f"[{','.join(map(in_yaml, value))}]"
     return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))

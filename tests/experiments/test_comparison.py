@@ -10,7 +10,7 @@ import pytest
 from helpers import TINY, TINY_CALL, command, command_here, fake_run, finish, start, wait_for_rows
 
 from mjx_walk import compare as compare_command
-from mjx_walk.experiments import planned_runs, suite
+from mjx_walk.experiments import planned_runs, slots, suite
 from mjx_walk.experiments.job_logs import failure_reason
 from mjx_walk.utils.errors import UserError
 
@@ -124,7 +124,7 @@ BAD = [
 @pytest.mark.parametrize(("arguments", "says"), BAD, ids=[" ".join(case[0]) for case in BAD])
 def test_compare_names_the_mistake(arguments, says, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(compare_command, "count_devices", lambda: ("cpu", 1))
+    monkeypatch.setattr(slots, "count_devices", lambda: ("cpu", 1))
     with pytest.raises(UserError) as error:
         compare_command.main(arguments)
     assert says in str(error.value) and "\n" not in str(error.value)
@@ -133,7 +133,7 @@ def test_compare_names_the_mistake(arguments, says, tmp_path, monkeypatch):
 
 def test_a_folder_with_other_settings_is_left_alone(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(compare_command, "count_devices", lambda: ("cpu", 1))
+    monkeypatch.setattr(slots, "count_devices", lambda: ("cpu", 1))
     fake_run(tmp_path / "out" / "ppo" / "seed_0", ["env=walker2d", "num_envs=128"], [1])
     for change, named in (
         ("num_envs=256", "num_envs"),

@@ -14,6 +14,7 @@ from helpers import command, command_here, finish, slow_except, start
 from mjx_walk import tune
 from mjx_walk.algos import ALGORITHMS, BUILT_IN_ALGORITHMS
 from mjx_walk.envs.model_files import ASSETS
+from mjx_walk.experiments import slots
 from mjx_walk.experiments.search_space import Choices, Interval, default_space, read_space
 from mjx_walk.experiments.study import StudyFolder, facts_of, require_optuna
 from mjx_walk.experiments.suggestions import TICKS
@@ -116,7 +117,7 @@ def test_a_value_is_the_mean_of_the_last_three_evaluations_and_of_seeds():
 def test_without_optuna_one_line_names_the_extra(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "optuna", None)
-    monkeypatch.setattr(tune, "count_devices", lambda: ("cpu", 1))
+    monkeypatch.setattr(slots, "count_devices", lambda: ("cpu", 1))
     for arguments in ([*PPO, "algo.discount=0.9,0.99"], ["draw=true", "out=."]):
         with pytest.raises(UserError, match=r"^Optuna is missing: pip install 'mjx-walk\[tune\]'$"):
             tune.main(arguments)
