@@ -30,7 +30,7 @@ class DeterministicConfig(OffPolicyConfig):
     """Std of the Gaussian noise on the first environment's actions, in `[-1, 1]`."""
     max_exploration_noise: float = setting(0.1, at_least=0)
     """Std for the last environment, evenly spaced in between: some environments explore, some stay near the policy."""
-    noise_repeat: int = setting(
+    noise_repeat: int | None = setting(
         1,
         at_least=1,
         only_if={
@@ -39,7 +39,10 @@ class DeterministicConfig(OffPolicyConfig):
             "learning_starts": AnyBut(0),
         },
     )
-    """Steps for which a sample of exploration noise, or a random action before learning starts, is kept."""
+    """Steps for which a sample of exploration noise, or a random action before learning starts, is kept.
+
+    If unset, those of about 64 ms.
+    """
 
 
 class DeterministicState(flax.struct.PyTreeNode):

@@ -26,10 +26,10 @@ class OffPolicyConfig:
     """Dtype of the stored observations."""
     learning_starts: int = setting(10_000, at_least=0)
     """Environment steps with uniformly random actions, before learning starts."""
-    noise_repeat: int = setting(1, at_least=1)
-    """Steps for which a sample of exploration noise is kept."""
-    n_step: int = setting(1, at_least=1)
-    """Steps whose rewards a critic's target sums up."""
+    noise_repeat: int | None = setting(1, at_least=1)
+    """Steps for which a sample of exploration noise is kept. If unset, those of about 64 ms."""
+    n_step: int | None = setting(1, at_least=1)
+    """Steps whose rewards a critic's target sums up. If unset, those of about 40 ms."""
     discount: float = setting(0.99, at_least=0, at_most=1)
     """Discount factor γ of one step."""
     final_discount: float | None = setting(None, at_least=0, below=1)
