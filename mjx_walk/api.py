@@ -12,7 +12,7 @@ from pathlib import Path
 import yaml
 
 from mjx_walk import zoo
-from mjx_walk.algos import Algorithm, make_algorithm
+from mjx_walk.algos import Algorithm, OffPolicyConfig, make_algorithm
 from mjx_walk.cli.parsing import refuse_flags
 from mjx_walk.envs import BUILT_IN_TASKS, Task, register_task
 from mjx_walk.envs.physics import resolve_engine
@@ -38,6 +38,7 @@ from mjx_walk.storage.saved_yaml import read_yaml
 from mjx_walk.storage.scores import BEST, Scores
 from mjx_walk.training.checks import as_saved, check_replay, prepared
 from mjx_walk.training.distributed import Processes, per_device
+from mjx_walk.training.init_from import read_networks
 from mjx_walk.training.messages import announce
 from mjx_walk.training.trainer import Trainer
 from mjx_walk.utils.errors import UserError
@@ -187,8 +188,9 @@ def train(
         if task.reward_hashes and processes.is_main_process:
             remember(configs[0].env.reward_function, task.reward_hashes)
         algorithm = _make_algorithm(configs[0], task, processes)
+        networks = read_networks(configs[0], algorithm)
         folders, configs = _prepare(configs, algorithm, processes, closing, runs)
-        trainer = Trainer(configs, algorithm, folders, processes, on_metrics)
+        trainer = Trainer(configs, algorithm, folders, processes, on_metrics, networks)
         with as_by_ctrl_c(), contextlib.closing(trainer):
             signal_name = trainer.train()
             if not signal_name:
@@ -201,6 +203,8 @@ def train(
 def _make_algorithm(config: Config, task: Task, processes: Processes) -> Algorithm:
     """The algorithm of a run on this process's device."""
     evaluation, algo = (per_device(own, processes.process_count) for own in (config.evaluation, config.algo))
+    if config.init_from and isinstance(algo, OffPolicyConfig) and algo.random_steps is None:
+        algo = dataclasses.replace(algo, random_steps=0)  # its policy acts from the start
     return make_algorithm(task, config.num_envs, evaluation, algo, processes.axis_name)
 
 

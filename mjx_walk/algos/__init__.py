@@ -7,7 +7,15 @@ from typing import Protocol
 
 from mjx_walk.machine import quiet_mjx  # noqa: F401  # isort: skip
 from mjx_walk.algos.a2c import A2C, A2CConfig
-from mjx_walk.algos.base import Algorithm, AlgorithmConfig, TrainState, is_finite, learned_leaves, without_replay
+from mjx_walk.algos.base import (
+    Algorithm,
+    AlgorithmConfig,
+    TrainState,
+    is_finite,
+    learned_leaves,
+    with_replay_of,
+    without_replay,
+)
 from mjx_walk.algos.csac import CSAC, CSACConfig
 from mjx_walk.algos.ddpg import DDPG, DDPGConfig
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
@@ -40,11 +48,13 @@ __all__ = [
     "BUILT_IN_ALGORITHMS",
     "Algorithm",
     "NamedConfig",
+    "OffPolicyConfig",
     "TrainState",
     "is_finite",
     "learned_leaves",
     "make_algorithm",
     "register_algorithm",
+    "with_replay_of",
     "without_replay",
 ]
 

@@ -116,6 +116,12 @@ class OffPolicyAlgorithm(
         return self.config.grad_updates_per_step * self.config.unroll_length
 
     @property
+    def num_random_steps(self) -> int:
+        """Environment steps with uniformly random actions."""
+        given = self.config.random_steps
+        return self.config.learning_starts if given is None else given
+
+    @property
     def rows_before_learning(self) -> int:
         """Steps of all environments before the first update."""
         return max(-(-self.config.learning_starts // self.num_envs), self.n_step + 1)
@@ -138,6 +144,10 @@ class OffPolicyAlgorithm(
 
     def policy_params(self, state: OffPolicyState[LearnerT]) -> PolicyParams:
         return (state.normalizer, state.learner.policy)
+
+    def with_policy(self, state: OffPolicyState[LearnerT], policy_params: PolicyParams) -> OffPolicyState[LearnerT]:
+        normalizer, policy = policy_params
+        return state.replace(normalizer=normalizer, learner=state.learner.replace(policy=policy))
 
     def policy(self, policy_params: PolicyParams, deterministic: bool = True) -> PolicyFn:
         normalizer, params = policy_params
@@ -182,7 +192,7 @@ class OffPolicyAlgorithm(
         self, state: OffPolicyState[LearnerT], obs: Float[Array, "B observation_size"], key: PRNGKeyArray
     ) -> tuple[Float[Array, "B action_size"], Float[Array, "B action_size"]]:
         """Gymnasium's action and the networks'; uniformly random before learning starts."""
-        is_random = state.iterations * float(self.steps_per_iteration) < self.config.learning_starts
+        is_random = state.iterations * float(self.steps_per_iteration) < self.num_random_steps
         explore_key, uniform_key = jax.random.split(key)
         chosen = self.explore(state.learner.policy, self.normalize(state.normalizer, obs), explore_key)
         uniform = jax.random.uniform(uniform_key, chosen.shape, minval=-1.0, maxval=1.0)

@@ -25,7 +25,9 @@ class OffPolicyConfig:
     replay_dtype: str = setting("float32", choices=("float32", "bfloat16"))
     """Dtype of the stored observations."""
     learning_starts: int = setting(10_000, at_least=0)
-    """Environment steps with uniformly random actions, before learning starts."""
+    """Environment steps before learning starts."""
+    random_steps: int | None = setting(None, at_least=0)
+    """Environment steps with uniformly random actions. If unset, `learning_starts`, or none with `init_from`."""
     noise_repeat: int | None = setting(1, at_least=1)
     """Steps for which a sample of exploration noise is kept. If unset, those of about 64 ms."""
     n_step: int | None = setting(1, at_least=1)

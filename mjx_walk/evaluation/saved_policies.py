@@ -92,11 +92,11 @@ class SavedPolicy:
 
     @functools.cached_property
     def command(self) -> str:
-        """The command that trained the policy. It names a reward function's file without the user's folders."""
+        """The command that trained the policy. It names files and another run without the user's folders."""
         saved = read_saved_config(RunFolder(self.path))
-        own = saved.env.reward_function
+        own, source = saved.env.reward_function, saved.init_from
         env = dataclasses.replace(saved.env, reward_function=own and Path(own).name)
-        return training_command(dataclasses.replace(saved, env=env))
+        return training_command(dataclasses.replace(saved, env=env, init_from=source and Path(source).name))
 
     @functools.cached_property
     def act(self) -> Act:

@@ -5,13 +5,16 @@ import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
+import jax.numpy as jnp
+
+from mjx_walk.algos import TrainState, learned_leaves
 from mjx_walk.machine.devices import default_device
 from mjx_walk.settings.config import Config
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import BEST, FINAL, Scores
 from mjx_walk.utils.text import duration
 
-__all__ = ["announce", "choice_line", "end_lines", "score_lines"]
+__all__ = ["announce", "choice_line", "divergence", "end_lines", "score_lines"]
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -47,6 +50,24 @@ def announce(config: Config, folders: list[RunFolder], num_devices: int) -> None
         _LOGGER.info("On the first run on a machine, Warp compiles its kernels, which takes half a minute or more.")
         if config.profile_calls > 1 and num_devices == 1:
             _LOGGER.warning("JAX's profiler has hung in a second recorded call of Warp on one GPU; use profile_calls=1")
+
+
+def divergence(states: list[TrainState], seeds: list[int], env_steps: int) -> str:
+    """Name the runs that have diverged, each with its first learned leaf that is not finite.
+
+    Args:
+        states: of the runs that train together, without the replay.
+        seeds: their seeds.
+        env_steps: their environment steps.
+    """
+    found = []
+    for seed, state in zip(seeds, states, strict=True):
+        names = [name for name, leaf in learned_leaves(state).items() if not jnp.isfinite(leaf).all()]
+        found += [f"{name} of seed {seed}" for name in names[:1]]
+    return (
+        f"training has diverged: after {env_steps:,} steps {', '.join(found)} is not finite; "
+        "earlier checkpoints are kept; start a new run with a lower learning rate, or clip gradients"
+    )
 
 
 def score_lines(
