@@ -65,6 +65,7 @@ RUN_BY_OTHER_TESTS = {
     "without_jax.py": "interop/test_onnx.py",
     "read_dataset.py": "interop/test_minari.py",
     "in_rejax.py": "interop/test_gymnax_env.py",
+    "brax_pendulum.py": "interop/test_external_runs.py",
     "huber_a2c.py": "test_examples.py",
 }
 

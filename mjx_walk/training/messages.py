@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
+from mjx_walk.envs import TASKS, Task
 from mjx_walk.machine.devices import default_device
 from mjx_walk.settings.config import Config
 from mjx_walk.storage.run_folder import RunFolder
@@ -30,7 +31,7 @@ def announce(config: Config, folders: list[RunFolder], num_devices: int) -> None
     path = folders[0].path if len(folders) == 1 else f"{len(folders)} folders of {folders[0].path.parent}"
     env, algo = config.env.name, config.algo
     _LOGGER.info("Training %s with %s on %s, physics=%s, in %s", env, algo.name, where, config.physics, path)
-    if config.hardware == "cpu":
+    if config.hardware == "cpu" and issubclass(TASKS[env][0], Task):
         _LOGGER.info(
             "JAX runs on the CPU: this is the recipe for a CPU. By default the physics is MuJoCo's C library. "
             "Expect a gait after minutes to tens of minutes; recipes for a GPU reach much higher scores."
