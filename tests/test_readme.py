@@ -193,6 +193,7 @@ TRAINED_ELSEWHERE = {
     r"train env=humanoid algo=\w+$": "storage/test_old_runs.py",
     r"train .*\bseeds=": "training/test_seeds.py",
     r"train -m ": "test_train.py",
+    r"train env.task=brax_pendulum": "interop/test_external_runs.py",
 }
 """Commands with the test that trains so to the end. Here, they end when JAX has traced their programs."""
 
@@ -226,6 +227,7 @@ def test_every_command(line, small_run, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     exec(compile(file("heavy_torso.py"), "heavy_torso.py", "exec"), {})
     Path("go2.xml").write_text(small_robot())
+    Path("brax_pendulum.py").write_text(file("brax_pendulum.py"))
     if "own_robot.py" in line:
         pytest.importorskip("dm_control")
         shutil.copytree(CLONE / "docs" / "examples", "docs/examples")
