@@ -3,7 +3,6 @@
 import logging
 import shlex
 from collections.abc import Mapping
-from pathlib import Path
 
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.machine.devices import default_device
@@ -82,7 +81,9 @@ def choice_line(taken: str) -> str:
     return f"The best policy has the highest evaluation during training. eval scores the final one: policy={FINAL}"
 
 
-def end_lines(folders: list[Path], training_seconds: float, total_seconds: float, is_scored: bool) -> list[str]:
+def end_lines(
+    folders: list[RunFolder], training_seconds: float, total_seconds: float, is_scored: bool, has_model: bool
+) -> list[str]:
     """The time, the folder, and the next command.
 
     Args:
@@ -90,12 +91,18 @@ def end_lines(folders: list[Path], training_seconds: float, total_seconds: float
         training_seconds: seconds of training, without scoring.
         total_seconds: seconds of training and scoring.
         is_scored: whether the policies were scored.
+        has_model: whether the task has a model to draw.
     """
     time = duration(total_seconds)
     if is_scored:
         time = f"{time}, of which training took {duration(training_seconds)}"
-    where = str(folders[0]) if len(folders) == 1 else f"{len(folders)} folders of {folders[0].parent}"
-    next_step = (
-        "To watch the best policy: python -m mjx_walk.play" if is_scored else "To score: python -m mjx_walk.eval"
-    )
-    return [f"Finished in {time}. The results are in {where}", f"{next_step} {shlex.quote(f'run={folders[0]}')}"]
+    path = folders[0].path
+    where = str(path) if len(folders) == 1 else f"{len(folders)} folders of {path.parent}"
+    run = shlex.quote(f"run={path}")
+    if not has_model:
+        next_step = f"To load the best policy: mjx_walk.load_run({str(path)!r}, task=…)"
+    elif is_scored:
+        next_step = f"To watch the best policy: python -m mjx_walk.play {run}"
+    else:
+        next_step = f"To score: python -m mjx_walk.eval {run}"
+    return [f"Finished in {time}. The results are in {where}", next_step]

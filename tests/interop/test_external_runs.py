@@ -115,6 +115,7 @@ def test_a_training_by_command_is_resumed_and_scored_without_its_file(tmp_path):
     for arguments in (("train", *small("csac"), *named), ("train", "run_dir=run", "resume=true", "total_steps=128")):
         done = command(*arguments, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
+        assert "To load the best policy: mjx_walk.load_run('run', task=…)" in done.stdout + done.stderr
     done = command("eval", "run=run", "episodes=2", cwd=tmp_path)
     assert "brax_fast on brax" in done.stdout, done.stderr
 
