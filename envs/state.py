@@ -147,7 +147,7 @@ class TrainableTask(Protocol):
     max_episode_steps: int
     """Time limit, after which `State.truncated` is set."""
     dt: float
-    """Time of a step, s."""
+    """Time of a step, s; infinite where steps have no duration."""
 
     def reset(self, key: PRNGKeyArray) -> State:
         """Random initial state."""

@@ -12,7 +12,7 @@ from jax import Array
 from jaxtyping import Bool, PRNGKeyArray
 
 from mjx_walk.common.inline_evaluation import EvaluationConfig, InlineEvaluation, InlineEvaluator
-from mjx_walk.envs import Task
+from mjx_walk.envs import BaseTask
 from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.envs.vector_env import VectorEnv, VectorState
 from mjx_walk.utils.types import (
@@ -101,7 +101,7 @@ class Algorithm(abc.ABC, Generic[_StateT, _BatchT, _ConfigT]):
     `jit`; constants are built when it is constructed.
     """
 
-    task: Task
+    task: BaseTask
     """The unbatched environment."""
     num_envs: int
     """Environments that train, B."""

@@ -146,8 +146,8 @@ class Trainer:
                 self._score_runs(num_episodes, seconds)
         finally:
             self._wait_for_files()
-        paths = [folder.path for folder in self._folders]
-        for line in end_lines(paths, seconds, self._seconds(), bool(num_episodes)) if is_main else ():
+        lines = end_lines(self._folders, seconds, self._seconds(), bool(num_episodes), bool(task.model_file))
+        for line in lines if is_main else ():
             _LOGGER.info(line)
 
     def close(self) -> None:
