@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import pickle
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from mjx_walk.envs import BUILT_IN_TASKS, make_env
 from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium
 from mjx_walk.logs.metrics import write_csv
-from mjx_walk.storage.files import replacing
+from mjx_walk.storage.folders import replacing_folder
 from mjx_walk.storage.scores import Scores
+from mjx_walk.utils.errors import UserError
 
 __all__ = ["Keeper", "Kept", "resumed", "score"]
 
@@ -75,13 +77,33 @@ class Keeper(BaseCallback):
 
 
 def resumed(folder: Path, algo: str, env: gymnasium.Env, seed: int) -> tuple[OffPolicyAlgorithmJax, list[Kept]]:
-    """The training of a folder as it was saved, with the policies kept so far; a new one in an empty folder."""
-    kind = _ALGORITHMS[algo]
-    if not (folder / "kept.pickle").exists():
+    """The training of a folder as it was saved, with the policies kept so far; a new one in an empty folder.
+
+    Raises:
+        UserError: the folder holds another training.
+    """
+    kind, asked = _ALGORITHMS[algo], _facts(algo, env, seed)
+    if not folder.exists():
         return kind("MlpPolicy", env, seed=seed, learning_starts=_LEARNING_STARTS), []
+    facts, kept = pickle.loads((folder / "kept.pickle").read_bytes())
+    if facts != asked:
+        raise UserError(f"{folder} is {facts}, not {asked}; choose another --out")
     model = kind.load(folder / "model.zip", env)
     model.load_replay_buffer(folder / "replay.pkl")
-    return model, pickle.loads((folder / "kept.pickle").read_bytes())
+    return model, kept
+
+
+def _facts(algo: str, env: gymnasium.Env, seed: int) -> str:
+    assert env.spec
+    return f"{algo} on {env.spec.id}, seed {seed}"
+
+
+def _save(folder: Path, model: OffPolicyAlgorithmJax, facts: str, kept: list[Kept]) -> None:
+    """Save a training, all of its files at once."""
+    with replacing_folder(folder) as new:
+        model.save(new / "model.zip")
+        model.save_replay_buffer(new / "replay.pkl")
+        (new / "kept.pickle").write_bytes(pickle.dumps((facts, kept)))
 
 
 def score(model: OffPolicyAlgorithmJax, task_name: str, kept: Kept, episodes: int) -> Scores:
@@ -107,16 +129,13 @@ def main() -> None:
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     env = gymnasium.make(make_env(given.env, physics="c").gymnasium_id)
-    model, kept = resumed(given.out, given.algo, env, given.seed)
+    model, kept = resumed(given.out / "training", given.algo, env, given.seed)
     keeper = Keeper(given.every, given.seconds, kept)
     left = given.total_steps - model.num_timesteps
     if left > 0:
         model.learn(left, keeper, reset_num_timesteps=not kept)
         keeper.keep()
-        model.save(given.out / "model.zip")
-        model.save_replay_buffer(given.out / "replay.pkl")
-        with replacing(given.out / "kept.pickle") as new:
-            new.write_bytes(pickle.dumps(kept))
+        _save(given.out / "training", model, _facts(given.algo, env, given.seed), kept)
     rows = []
     for one in kept:
         scores = score(model, given.env, one, given.episodes if one is kept[-1] else -(-given.episodes // 5))
@@ -127,4 +146,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except UserError as error:
+        sys.exit(f"error: {error}")

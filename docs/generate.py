@@ -33,6 +33,7 @@ def pages() -> dict[Path, str]:
     for page, blocks in _figures().items():
         found[DOCS / page] = _filled(page, blocks)
     found[DOCS / "training.md"] = _filled("training.md", {"scaling-summary": scaling.summary()})
+    found[DOCS / "tuning.md"] = _filled("tuning.md", {"ranges": setting_tables.search_ranges()})
     robots = {name: setting_tables.task_tables(name) for name in BUILT_IN_TASKS if name not in task_pages.NAMES}
     found[DOCS / "your_own.md"] = _filled("your_own.md", robots | {_ROBOTS: measured_tables.all_in(".")[_ROBOTS]})
     groups["presets"] = setting_tables.presets()

@@ -11,7 +11,7 @@ from mjx_walk.utils.versions import __version__
 
 __all__ = ["COMMANDS", "main", "usage"]
 
-COMMANDS = ("train", "eval", "play", "plots", "export", "zoo", "compare", "bench", "parity")
+COMMANDS = ("train", "eval", "play", "plots", "export", "zoo", "compare", "tune", "bench", "parity")
 _PACKAGES = ("zoo",)
 """Commands that are packages."""
 _OTHER_NAMES = {
@@ -20,6 +20,7 @@ _OTHER_NAMES = {
     "play": ("enjoy", "record", "render", "video", "view", "watch"),
     "plots": ("draw",),
     "zoo": ("list",),
+    "tune": ("optimize", "search"),
     "bench": ("benchmark",),
     "--version": ("v", "version"),
 }

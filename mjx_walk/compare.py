@@ -5,7 +5,6 @@
 
 import dataclasses
 import functools
-import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.cli import parsing
 from mjx_walk.experiments import planned_runs
+from mjx_walk.experiments.job_logs import failure_reason
 from mjx_walk.experiments.planned_runs import PlannedRun
 from mjx_walk.experiments.report import write_report
 from mjx_walk.experiments.suite import SUITES, plan_suite
@@ -107,22 +107,14 @@ def _on_progress(run: PlannedRun) -> None:
 def _on_end(out: Path, run: PlannedRun, log: Path) -> None:
     """Print how a run has ended, and update the report."""
     if not run.is_finished:
-        print(f"{run.name}: not finished{_reason(log)}; see {log}", flush=True)
+        reason = failure_reason(log, "so try together=1 or a smaller num_envs")
+        print(f"{run.name}: not finished{': ' if reason else ''}{reason}; see {log}", flush=True)
         return
     print(f"{run.name}: finished", flush=True)
     try:
         write_report(out)
     except (UserError, OSError, ValueError) as error:  # the other runs continue
         print(f"warning: {out} could not be drawn: {error}", file=sys.stderr)
-
-
-def _reason(log: Path) -> str:
-    """Why a job has ended: the line of its error, or of its exception."""
-    text = log.read_text(encoding="utf-8", errors="replace")[-10_000:]
-    if "RESOURCE_EXHAUSTED" in text:
-        return ": memory ran out, so try together=1 or a smaller num_envs"
-    found = re.findall(r"^(?:error: (.+)|([\w.]+(?:Error|Exception)\b.*))$", text, re.MULTILINE)
-    return f": {''.join(found[-1])}" if found else ""
 
 
 def _print_report(out: Path) -> None:

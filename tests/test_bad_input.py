@@ -9,7 +9,7 @@ import sys
 import pytest
 from helpers import TINY, TINY_CALL, command, command_here, edit_config, train_here
 
-from mjx_walk import api
+from mjx_walk import api, tune
 from mjx_walk import bench as bench_command
 from mjx_walk import compare as compare_command
 from mjx_walk import eval as eval_command
@@ -143,7 +143,9 @@ def test_bench_names_its_own_keys():
         bench_command.main(["second=3"])
 
 
-@pytest.mark.parametrize("command", [train_command.Own, bench_command.Arguments, compare_command.Arguments])
+@pytest.mark.parametrize(
+    "command", [train_command.Own, bench_command.Arguments, compare_command.Arguments, tune.Arguments]
+)
 def test_no_setting_is_taken_for_a_command_s_own(command):
     own = {field.name for field in dataclasses.fields(command)}
     for env, algo in [*((env, "ppo") for env in TASKS), *(("humanoid", algo) for algo in ALGORITHMS)]:

@@ -52,6 +52,9 @@ def test_a_training_of_sbx_continues_and_is_scored(tmp_path, monkeypatch):
     for total, seconds in (("60", "0"), ("60", "1000")):
         monkeypatch.setattr(sys, "argv", ["sbx_training.py", *settings, "--total-steps", total, "--seconds", seconds])
         runpy.run_path(str(CLONE / "benchmarks" / "sbx_training.py"), run_name="__main__")
+    monkeypatch.setattr(sys, "argv", ["sbx_training.py", *settings, "--seed", "1"])
+    with pytest.raises(SystemExit, match="training is tqc on InvertedPendulum-v5, seed 0, not tqc on"):
+        runpy.run_path(str(CLONE / "benchmarks" / "sbx_training.py"), run_name="__main__")
     header, *rows = (line.split(",") for line in (tmp_path / "returns.csv").read_text().splitlines())
     assert header == ["steps", "seconds", "episodes", "mean", "std"]
     assert [row[0] for row in rows] == ["1", "20", "40", "60"] and [row[2] for row in rows] == ["1", "1", "1", "5"]

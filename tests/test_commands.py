@@ -75,9 +75,10 @@ def test_a_command_gets_its_arguments(monkeypatch, capsys):
         ("-v", "did you mean: --version?"),
         (
             "--env",
-            "the command comes first; choose one of: train, eval, play, plots, export, zoo, compare, bench, parity",
+            "the command comes first; "
+            "choose one of: train, eval, play, plots, export, zoo, compare, tune, bench, parity",
         ),
-        ("fly", "choose one of: train, eval, play, plots, export, zoo, compare, bench, parity"),
+        ("fly", "choose one of: train, eval, play, plots, export, zoo, compare, tune, bench, parity"),
     ],
 )
 def test_an_unknown_command_is_named(monkeypatch, capsys, command, says):

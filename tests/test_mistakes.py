@@ -14,7 +14,7 @@ import pytest
 from helpers import OLD_RUNS, renders
 
 import mjx_walk
-from mjx_walk import compare, play, zoo
+from mjx_walk import compare, play, tune, zoo
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.cli import parsing
 from mjx_walk.envs import GYMNASIUM_TASKS, TASKS
@@ -75,7 +75,7 @@ def files(folder, monkeypatch):
     monkeypatch.chdir(folder)
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    for module in (compare, launcher):  # asks another process
+    for module in (compare, launcher, tune):  # asks another process
         monkeypatch.setattr(module, "count_devices", lambda: ("cpu", 1))
     before = sorted(folder.rglob("*"))
     yield folder

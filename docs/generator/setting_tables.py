@@ -2,9 +2,10 @@
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 
 from generator.markdown import code, first_sentence, table
-from mjx_walk.algos import ALGORITHMS
+from mjx_walk.algos import ALGORITHMS, BUILT_IN_ALGORITHMS
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.common.inline_evaluation import EvaluationConfig
 from mjx_walk.envs import TASKS
@@ -87,6 +88,24 @@ def own_groups(schema: type) -> list[tuple[type, str]]:
 def algorithm_table(name: str) -> str:
     """The settings of an algorithm."""
     return settings_table(ALGORITHMS[name][1], "algo.")
+
+
+def search_ranges() -> str:
+    """The table of the ranges that a study searches by default."""
+    owners: dict[tuple[str, str], list[str]] = {}
+    for algo in BUILT_IN_ALGORITHMS:
+        for field in dataclasses.fields(ALGORITHMS[algo][1]):
+            search = field.metadata.get("search")
+            if search:
+                text = code(search) if isinstance(search, str) else _factors(search)
+                owners.setdefault((f"algo.{field.name}", text), []).append(code(algo))
+    rows = [[code(key), text, ", ".join(algos)] for (key, text), algos in owners.items()]
+    return table(["Setting", "Values", "Algorithms"], rows)
+
+
+def _factors(factors: Sequence[float]) -> str:
+    *first, last = map(str, factors)
+    return f"{', '.join(first)} and {last} times the recipe's value"
 
 
 def algorithms(pages: dict[str, str]) -> str:

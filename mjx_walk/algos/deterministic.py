@@ -28,7 +28,7 @@ class DeterministicConfig(OffPolicyConfig):
 
     min_exploration_noise: float = setting(0.1, at_least=0)
     """Std of the Gaussian noise on the first environment's actions, in `[-1, 1]`."""
-    max_exploration_noise: float = setting(0.1, at_least=0)
+    max_exploration_noise: float = setting(0.1, at_least=0, search="0.1,0.2,0.4,1.0")
     """Std for the last environment, evenly spaced in between: some environments explore, some stay near the policy."""
     noise_repeat: int | None = setting(
         1,

@@ -14,11 +14,11 @@ class OffPolicyConfig:
 
     unroll_length: int = setting(4, at_least=1)
     """Steps of each environment between two learning phases. All environments step together."""
-    grad_updates_per_step: int = setting(8, at_least=1)
+    grad_updates_per_step: int = setting(8, at_least=1, search=(0.5, 1, 2))
     """Critic updates for each step of all environments. The update-to-data ratio is this divided by `num_envs`."""
     policy_delay: int = setting(1, at_least=1)
     """Critic updates for each policy update."""
-    batch_size: int = setting(4096, at_least=1)
+    batch_size: int = setting(4096, at_least=1, search=(0.5, 1, 2))
     """Transitions of one gradient update."""
     replay_capacity: int = setting(1_000_000, at_least=1)
     """Transitions, rounded up to complete unrolls."""
@@ -30,17 +30,17 @@ class OffPolicyConfig:
     """Environment steps with uniformly random actions. If unset, `learning_starts`, or none with `init_from`."""
     noise_repeat: int | None = setting(1, at_least=1)
     """Steps for which a sample of exploration noise is kept. If unset, those of about 64 ms."""
-    n_step: int | None = setting(1, at_least=1)
+    n_step: int | None = setting(1, at_least=1, search="1,3,5")
     """Steps whose rewards a critic's target sums up. If unset, those of about 40 ms."""
-    discount: float = setting(0.99, at_least=0, at_most=1)
+    discount: float = setting(0.99, at_least=0, at_most=1, search="0.95,0.97,0.98,0.99,0.995,0.999")
     """Discount factor γ of one step."""
     final_discount: float | None = setting(None, at_least=0, below=1)
     """Discount after `schedule_steps`. The horizon 1 / (1 - γ) changes by the same factor at every step."""
-    tau: float = setting(0.005, above=0, at_most=1)
+    tau: float = setting(0.005, above=0, at_most=1, search="tag(log,interval(0.002,0.05))")
     """Fraction by which target networks move at each update."""
-    policy_learning_rate: float = setting(3e-4, above=0)
+    policy_learning_rate: float = setting(3e-4, above=0, search="tag(log,interval(3e-5,3e-3))")
     """Step size of Adam for the policy."""
-    critic_learning_rate: float = setting(3e-4, above=0)
+    critic_learning_rate: float = setting(3e-4, above=0, search="tag(log,interval(3e-5,3e-3))")
     """Step size of Adam for the critics."""
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear"))
     """`linear`: the rates of policy and critics fall to zero over `schedule_steps`."""

@@ -12,7 +12,7 @@ __all__ = ["OnPolicyConfig"]
 class OnPolicyConfig:
     """Settings that all on-policy algorithms have."""
 
-    unroll_length: int = setting(10, at_least=1)
+    unroll_length: int = setting(10, at_least=1, search=(0.5, 1, 2))
     """Steps of one unroll, over which advantages are estimated."""
     num_unrolls: int = setting(4, at_least=1, at_most=2**31 - 1)
     """Unrolls of every environment in one batch."""
@@ -20,12 +20,14 @@ class OnPolicyConfig:
     """First steps of each environment. Their batches only set the scale of observations and rewards. Ten are too few on
     Humanoid, which falls after 24 random actions. Under their scale, positions in the next ten steps are two standard
     deviations from the mean, and learning starts with a KL of 3 to 13."""
-    learning_rate: float = setting(3e-4, above=0)
+    learning_rate: float = setting(3e-4, above=0, search="tag(log,interval(3e-5,3e-3))")
     """Step size of Adam, for policy and value network."""
     learning_rate_schedule: str = setting("constant", choices=("constant", "linear", "adaptive_kl"))
     """`linear`: falls to zero over `schedule_steps`. `adaptive_kl`: as `linear`, and the policy's rate is adapted
     after each batch, so that a batch moves the policy by a KL of about `target_kl`."""
-    target_kl: float = setting(0.01, above=0, only_if={"learning_rate_schedule": "adaptive_kl"})
+    target_kl: float = setting(
+        0.01, above=0, only_if={"learning_rate_schedule": "adaptive_kl"}, search="tag(log,interval(0.005,0.2))"
+    )
     """KL divergence of one batch that `adaptive_kl` aims at."""
     schedule_steps: int = setting(
         100_000_000,
@@ -38,11 +40,11 @@ class OnPolicyConfig:
     max_value_grad_norm: float | None = setting(None, above=0)
     """Global norm to which the value network's gradient is clipped. If unset, `max_policy_grad_norm` clips the joint
     gradient of policy and value, as in Brax."""
-    discount: float = setting(0.97, at_least=0, at_most=1)
+    discount: float = setting(0.97, at_least=0, at_most=1, search="0.95,0.97,0.98,0.99,0.995,0.999")
     """Discount factor γ of one step."""
-    gae_lambda: float = setting(0.95, at_least=0, at_most=1)
+    gae_lambda: float = setting(0.95, at_least=0, at_most=1, search="0.9,0.95,0.98")
     """λ of generalized advantage estimation."""
-    entropy_coef: float = setting(1e-3, at_least=0)
+    entropy_coef: float = setting(1e-3, at_least=0, search="0.0,1e-3,3e-3,8e-3,0.02")
     """Coefficient of the entropy bonus."""
     entropy_schedule: str = setting("constant", choices=("constant", "linear"), only_if={"entropy_coef": AnyBut(0)})
     """`linear`: falls to zero over `schedule_steps`."""

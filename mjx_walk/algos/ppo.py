@@ -34,9 +34,9 @@ class PPOConfig(OnPolicyConfig):
     name: str = setting("ppo", choices=("ppo",))
     num_minibatches: int = setting(32, at_least=1)
     """Minibatches of one epoch, with one gradient step each."""
-    num_epochs: int = setting(8, at_least=1)
+    num_epochs: int = setting(8, at_least=1, search="interval(3,12)")
     """Passes over one batch."""
-    clip_epsilon: float = setting(0.3, above=0)
+    clip_epsilon: float = setting(0.3, above=0, search="0.1,0.2,0.3")
     """Largest change of the probability ratio from 1, ε."""
 
 

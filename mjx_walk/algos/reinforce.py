@@ -25,6 +25,7 @@ class REINFORCEConfig(PolicyGradientConfig):
 
     name: str = setting("reinforce", choices=("reinforce",))
     unroll_length: int = setting(256, at_least=1)
+    discount: float = setting(0.97, at_least=0, at_most=1, search="0.95,0.97,0.98,0.99")
     max_tail_discount: float = setting(0.05, above=0, at_most=1)
     """A step is used only if the discount on its unobserved tail is at most this."""
     baseline: str = setting("linear", choices=("mean", "linear"))

@@ -31,7 +31,7 @@ class SACConfig(OffPolicyConfig):
     """Initial temperature."""
     alpha_learning_rate: float = setting(3e-4, above=0)
     """Step size of Adam for the temperature. It stays constant."""
-    target_entropy: float = setting(-0.5, below=0.69)
+    target_entropy: float = setting(-0.5, below=0.69, search="interval(-1,0.5)")
     """Entropy at which the temperature keeps the policy, in nats per action dimension; Brax uses -0.5. Actions lie in
     `[-1, 1]`, so no policy has more than ln 2, and under a higher target the temperature would grow without bound."""
     final_target_entropy: float | None = setting(None, below=0.69)

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from mjx_walk.envs import State, Task
 from mjx_walk.evaluation.recorded_episodes import RecordedEpisode, episodes_at_once
 from mjx_walk.logs.progress import ScoringProgress
+from mjx_walk.machine.signals import undisturbed
 from mjx_walk.utils.types import PolicyFn
 
 __all__ = ["simulate_episodes"]
@@ -76,8 +77,9 @@ def _play_batch(
     chunks: list[_Step] = []
     over = np.zeros((0, len(state.obs)), bool)
     while not over.any(0).all():
-        state, steps = play(state)
-        chunks.append(jax.tree.map(np.asarray, steps))
+        with undisturbed("finishing the present steps"):
+            state, steps = play(state)
+            chunks.append(jax.tree.map(np.asarray, steps))
         over = np.concatenate((over, chunks[-1].terminated | chunks[-1].truncated))
         report(len(over), int(over.any(0).sum()))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *chunks), over.argmax(0) + 1

@@ -19,7 +19,7 @@ from mjx_walk.envs import TASKS
 from mjx_walk.logs.metrics import read_rows
 from mjx_walk.machine.devices import only_device
 from mjx_walk.machine.signals import Interrupt
-from mjx_walk.machine.subprocesses import start_module
+from mjx_walk.machine.subprocesses import start_module, with_parent
 from mjx_walk.settings.config import Config, load_config
 from mjx_walk.settings.input_files import changed_input
 from mjx_walk.settings.overrides import complete_overrides, sweep_choices
@@ -186,7 +186,9 @@ def most_together(runs: list[PlannedRun], num_slots: int) -> int:
     return 1
 
 
-def start_job(job: list[PlannedRun], log: Path, device: int | None, share: int, lock: int) -> subprocess.Popen:
+def start_job(
+    job: list[PlannedRun], log: Path, device: int | None, share: int, lock: int, ends_with_parent: bool = False
+) -> subprocess.Popen:
     """Start the process of a job. It resumes from the checkpoints, if there are some.
 
     Args:
@@ -195,6 +197,7 @@ def start_job(job: list[PlannedRun], log: Path, device: int | None, share: int, 
         device: the only GPU that the process sees; None changes nothing.
         share: jobs that share the GPU.
         lock: file descriptor that the process inherits.
+        ends_with_parent: whether the process saves and ends when this one ends, even by SIGKILL.
     """
     first = job[0]
     is_resumed = first.steps_saved is not None
@@ -203,6 +206,8 @@ def start_job(job: list[PlannedRun], log: Path, device: int | None, share: int, 
             with locked_folder(run.folder):
                 shutil.rmtree(run.folder.path)  # it ended before its first checkpoint
     env = only_device(device) if device is not None else {}
+    if ends_with_parent:
+        env |= with_parent()
     if share > 1 and "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:
         env["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{_MEMORY_FRACTION / share:.2f}"
     arguments = [*first.overrides, f"run_dir={first.folder.path.parent}", f"seeds={[run.config.seed for run in job]}"]

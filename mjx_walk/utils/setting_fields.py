@@ -62,6 +62,7 @@ def setting(
     below: float | None = None,
     choices: tuple[str, ...] | None = None,
     only_if: dict[str, Any] | None = None,
+    search: str | tuple[float, ...] | None = None,
 ) -> Any:
     """A dataclass field with a default, a valid range and a condition.
 
@@ -74,9 +75,11 @@ def setting(
         choices: valid values.
         only_if: values of other settings of the same dataclass, or `AnyBut` a value. The setting has an effect if one
             of them matches and has an effect itself. An empty dictionary: the setting never has an effect.
+        search: values that a study tries by default: a text in Hydra's grammar, such as `0.9,0.99`, or factors of the
+            recipe's value.
     """
     limits = {"above": above, "at_least": at_least, "at_most": at_most, "below": below, "choices": choices}
-    metadata = {k: v for k, v in (limits | {"only_if": only_if}).items() if v is not None}
+    metadata = {k: v for k, v in (limits | {"only_if": only_if, "search": search}).items() if v is not None}
     return dataclasses.field(default=default, metadata=metadata)
 
 

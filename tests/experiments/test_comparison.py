@@ -11,6 +11,7 @@ from helpers import TINY, TINY_CALL, command, command_here, fake_run, finish, st
 
 from mjx_walk import compare as compare_command
 from mjx_walk.experiments import planned_runs, suite
+from mjx_walk.experiments.job_logs import failure_reason
 from mjx_walk.utils.errors import UserError
 
 SMALL = (
@@ -192,15 +193,15 @@ def test_a_second_comparison_in_the_same_folder_waits_its_turn(tmp_path):
 @pytest.mark.parametrize(
     ("log", "reason"),
     [
-        ("Training …\nerror: no space\n", ": no space"),
-        ("Traceback (most recent call last):\n  …\njaxlib.XlaRuntimeError: no\n", ": jaxlib.XlaRuntimeError: no"),
-        ("XlaRuntimeError: RESOURCE_EXHAUSTED: 5 GB\n", ": memory ran out, so try together=1 or a smaller num_envs"),
+        ("Training …\nerror: no space\n", "no space"),
+        ("Traceback (most recent call last):\n  …\njaxlib.XlaRuntimeError: no\n", "jaxlib.XlaRuntimeError: no"),
+        ("XlaRuntimeError: RESOURCE_EXHAUSTED: 5 GB\n", "memory ran out, so try together=1"),
         ("Training …\n", ""),
     ],
 )
 def test_the_reason_of_a_failure_is_the_last_line_of_its_log(tmp_path, log, reason):
     (tmp_path / "log.txt").write_text(log)
-    assert compare_command._reason(tmp_path / "log.txt") == reason
+    assert failure_reason(tmp_path / "log.txt", "so try together=1") == reason
 
 
 @pytest.mark.parametrize("link", ["ppo", "logs", "logs/ppo"])
