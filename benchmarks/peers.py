@@ -110,6 +110,7 @@ class BraxTask(TrainableTask):
         self.env = env
         self.options = TaskOptions(name="brax", max_episode_steps=_EPISODE_LENGTH)
         self.max_episode_steps = _EPISODE_LENGTH
+        self.dt = float(env.dt)
         self.observation_size, self.action_size = env.observation_size, env.action_size
         self.action_low, self.action_high = -jnp.ones(env.action_size), jnp.ones(env.action_size)
         self.reward_terms: tuple[str, ...] = ()

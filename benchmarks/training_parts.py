@@ -22,7 +22,7 @@ from mjx_walk.api import resolve
 from mjx_walk.bench import describe_device, show, write
 from mjx_walk.cli import parsing
 from mjx_walk.common.replay_buffer import ReplayBuffer, Steps
-from mjx_walk.envs import Task
+from mjx_walk.envs import Task, require_model
 from mjx_walk.envs.physics import make_engine
 from mjx_walk.evaluation.saved_policies import make_task
 from mjx_walk.experiments.timing import Measurement
@@ -65,7 +65,7 @@ def main(command_line: list[str]) -> None:
     jax.config.update("jax_default_matmul_precision", config.matmul_precision)
     if arguments.out:
         parsing.check_writable(user_path(arguments.out))
-    task = make_task(config)
+    task = require_model(make_task(config))
     device = describe_device(task, config)
     print(f"{task.gymnasium_id} on {device}", flush=True)
     results = show(measure(config, task, arguments.seconds))

@@ -10,7 +10,8 @@ if __name__ != "mjx_walk.envs":  # a second import under another name would dupl
 import dataclasses
 from typing import Any
 
-from mjx_walk.envs.registry import BUILT_IN_TASKS, GYMNASIUM_TASKS, TASKS, register_task
+from mjx_walk.envs.base_task import BaseTask
+from mjx_walk.envs.registry import BUILT_IN_TASKS, GYMNASIUM_TASKS, TASKS, register_task, require_model
 from mjx_walk.envs.state import NO_TIME_LIMIT, State, TrainableTask
 from mjx_walk.envs.task import Task
 from mjx_walk.envs.task_options import TaskOptions, with_absolute_paths
@@ -26,6 +27,7 @@ __all__ = [
     "GYMNASIUM_TASKS",
     "NO_TIME_LIMIT",
     "TASKS",
+    "BaseTask",
     "State",
     "Task",
     "TaskOptions",
@@ -34,6 +36,7 @@ __all__ = [
     "make_env",
     "make_options",
     "register_task",
+    "require_model",
     "with_absolute_paths",
 ]
 
@@ -48,11 +51,11 @@ def make_env(name: str, physics: str = "auto", **kwargs: object) -> Task:
             keyword arguments of the Gymnasium class.
 
     Raises:
-        UserError: an unknown name, engine, version or option, or an invalid value.
+        UserError: an unknown name, engine, version or option, an invalid value, or an environment of another library.
     """
     prepare_jax()
     options = make_options(name, **kwargs)
-    return TASKS[name][0](options, physics)
+    return require_model(TASKS[name][0](options, physics))
 
 
 def make_options(name: str, **kwargs: Any) -> TaskOptions:

@@ -17,6 +17,7 @@ class ReadFiles(NamedTuple):
     """The files that a task has read."""
 
     model_file: str
+    """Empty for a task without a model."""
     model: dict[str, str]
     """SHA-256 by path relative to the model's folder."""
     reward: dict[str, str]
@@ -57,7 +58,8 @@ def warn_of_changed_files(files: ReadFiles) -> None:
     Raises:
         UserError: the model file is gone.
     """
-    warn_of_changed_sources(files.model_file, files.model)
+    if files.model_file:
+        warn_of_changed_sources(files.model_file, files.model)
     changed = changed_file(files.reward)
     if changed:
         _LOGGER.warning("%s has changed since it was loaded; it is used as it is now", changed)

@@ -5,6 +5,7 @@ import typing
 from pathlib import Path
 
 from mjx_walk.envs.ant import Ant, AntOptions
+from mjx_walk.envs.base_task import BaseTask, no_model
 from mjx_walk.envs.half_cheetah import HalfCheetah, HalfCheetahOptions
 from mjx_walk.envs.hopper import Hopper, HopperOptions
 from mjx_walk.envs.humanoid import Humanoid, HumanoidOptions
@@ -30,11 +31,12 @@ __all__ = [
     "is_registered_from",
     "register_task",
     "register_task_file",
+    "require_model",
     "task_hashes",
     "task_name",
 ]
 
-TASKS: dict[str, tuple[type[Task], type[TaskOptions]]] = {
+TASKS: dict[str, tuple[type[BaseTask], type[TaskOptions]]] = {
     "humanoid": (Humanoid, HumanoidOptions),
     "humanoid_standup": (HumanoidStandup, HumanoidStandupOptions),
     "walker2d": (Walker2d, Walker2dOptions),
@@ -60,14 +62,14 @@ _files: dict[str, tuple[str, dict[str, str]]] = {}
 """For each task from a file: its `FILE.py:CLASS`, and the SHA-256 of the files that ran, by absolute path."""
 
 
-def register_task(name: str, task: type[Task], options: type[TaskOptions] | None = None) -> None:
+def register_task(name: str, task: type[BaseTask], options: type[TaskOptions] | None = None) -> None:
     """Register a task, so that `env=NAME` and `make_env(NAME)` find it in this process.
 
     A class with the same module and name replaces a former one, as when a notebook's cell runs again.
 
     Args:
         name: lower-case letters, digits and underscores.
-        task: a subclass of `Task` that defines all its abstract methods.
+        task: a subclass of `Task` that defines all its abstract methods, or the result of `from_brax`.
         options: a dataclass derived from `TaskOptions`; by default the annotation of `task.options`, or `TaskOptions`.
 
     Raises:
@@ -78,7 +80,7 @@ def register_task(name: str, task: type[Task], options: type[TaskOptions] | None
     if name in BUILT_IN_TASKS:
         raise UserError(f"'{name}' is a task of this package; choose another name")
     known = {other: kind for other, (kind, _) in TASKS.items()}
-    check_class("a task", name, task, Task, "mjx_walk.envs", known)
+    check_class("a task", name, task, BaseTask, "a subclass of mjx_walk.envs.Task", known)
     for attribute in ("XML_FILES", "REWARD_TERMS"):
         if not isinstance(getattr(task, attribute, None), dict):
             raise UserError(f"the class {task.__name__} of the task '{name}' needs {attribute} = {{'v5': …}}")
@@ -108,6 +110,17 @@ def register_task_file(source: str) -> str:
     register_task(name, task)
     _files[name] = (source, file.hashes)
     return name
+
+
+def require_model(task: BaseTask) -> Task:
+    """The task itself, for what reads its MuJoCo model.
+
+    Raises:
+        UserError: it has none.
+    """
+    if isinstance(task, Task):
+        return task
+    raise no_model(task.options.name, task.engine.name)
 
 
 def task_hashes(name: str) -> dict[str, str]:

@@ -146,6 +146,8 @@ class TrainableTask(Protocol):
     """Names of the reward terms in `State.metrics`."""
     max_episode_steps: int
     """Time limit, after which `State.truncated` is set."""
+    dt: float
+    """Time of a step, s; infinite where steps have no duration."""
 
     def reset(self, key: PRNGKeyArray) -> State:
         """Random initial state."""

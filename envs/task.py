@@ -10,18 +10,18 @@ from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from mjx_walk.envs import models
+from mjx_walk.envs.base_task import BaseTask
 from mjx_walk.envs.custom_reward import CustomReward
 from mjx_walk.envs.ground.terrain import Terrain
-from mjx_walk.envs.info import GymnasiumInfo
 from mjx_walk.envs.model_changes import ModelSnapshot
 from mjx_walk.envs.model_files import source_hashes
 from mjx_walk.envs.motors import motor_dofs
-from mjx_walk.envs.physics import Derived, PhysicsState, make_engine, resolve_engine
+from mjx_walk.envs.physics import Derived, Engine, PhysicsState, make_engine, resolve_engine
 from mjx_walk.envs.pickling import build_again, files_of
 from mjx_walk.envs.randomization.episode import Randomizer
 from mjx_walk.envs.resets import InitialState
 from mjx_walk.envs.reward_shaping import RewardStep, Terms, check_shaping
-from mjx_walk.envs.state import Carry, State, TrainableTask, check_action_shape, first_state, is_finite, physics_state
+from mjx_walk.envs.state import Carry, State, check_action_shape, first_state, is_finite, physics_state
 from mjx_walk.envs.task_options import TaskOptions, check_version, with_absolute_paths
 from mjx_walk.envs.view import View
 from mjx_walk.machine.compat import standard_dtypes
@@ -30,14 +30,13 @@ from mjx_walk.storage.files import working_folder
 __all__ = ["Task"]
 
 
-class Task(GymnasiumInfo, TrainableTask, abc.ABC):
+class Task(BaseTask):
     """A Gymnasium MuJoCo environment as pure functions of `State`.
 
     Subclasses define observations, rewards and terminations. They do not depend on the engine.
     """
 
-    XML_FILES: dict[str, str | None]
-    """Model file of each version, among Gymnasium's assets. None: the task has no model, and needs `xml_file`."""
+    engine: Engine
     V5_ONLY: tuple[str, ...] = ("xml_file", "frame_skip")
     """Env options that Gymnasium's v4 class does not take."""
     V4_ONLY: tuple[str, ...] = ()
@@ -70,8 +69,8 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
                 reads or has what the engine does not simulate.
         """
         check_version(options, self.XML_FILES, self.MISSING_VERSIONS, {"v5": self.V5_ONLY, "v4": self.V4_ONLY})
-        self.options = options = with_absolute_paths(options, working_folder())
-        self.max_episode_steps = options.max_episode_steps
+        options = with_absolute_paths(options, working_folder())
+        super().__init__(options)
         self.model_file = models.model_file(options.xml_file or self.XML_FILES[options.version], options.name)
         self.ground = Terrain(options.ground, options.name, self.HAS_X, self.HAS_Y, self.HEIGHT_INDEX)
         self.model = self.load_model()
@@ -111,22 +110,19 @@ class Task(GymnasiumInfo, TrainableTask, abc.ABC):
         has_motors, can_fall = self._motor_dofs.size > 0, self.terminates_on_fall
         check_shaping(self.options.shaping, self.options.name, has_x, has_y, has_motors, can_fall)
 
+    @classmethod
+    def resolve_physics(cls, physics: str) -> str:
+        return resolve_engine(physics)
+
     @property
     def reward_hashes(self) -> dict[str, str]:
-        """SHA-256 of the reward function's files, by absolute path; empty without a reward function."""
         return self._custom_reward.hashes
 
     @property
     def has_custom_reward(self) -> bool:
-        """Whether the reward differs from Gymnasium's."""
         return self._custom_reward.changes_reward
 
     # Defined by each task, up to `reset`.
-
-    @property
-    def terminates_on_fall(self) -> bool:
-        """Whether a fall terminates the episode."""
-        return False
 
     def named_bodies(self) -> tuple[int | str, ...]:
         """Bodies that `observe`, `carry` and `reward_and_termination` read, as keys of `body_ids`."""

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_walk.envs.base_task import BaseTask
 from mjx_walk.envs.state import MAX_ABS_VALUE, State
-from mjx_walk.envs.task import Task
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import Metric, Metrics, Reduction
 
@@ -49,7 +49,7 @@ class Outcome(NamedTuple):
 class VectorEnv:
     """`num_envs` environments that train. Others, which it does not reset, join their physics calls."""
 
-    def __init__(self, task: Task, num_envs: int, init_at_random_episode_step: bool = False):
+    def __init__(self, task: BaseTask, num_envs: int, init_at_random_episode_step: bool = False):
         """
         Args:
             task: the unbatched environment.

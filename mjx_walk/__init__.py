@@ -14,6 +14,8 @@ __all__ = [
     "BraxEnv",
     "GymnaxEnv",
     "__version__",
+    "from_brax",
+    "from_gymnax",
     "load_run",
     "make_env",
     "make_rsl_rl_env",
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
     from mjx_walk.api import load_run, run
     from mjx_walk.envs import make_env, register_task
     from mjx_walk.interop.brax_env import BraxEnv
+    from mjx_walk.interop.from_brax import from_brax
+    from mjx_walk.interop.from_gymnax import from_gymnax
     from mjx_walk.interop.gymnax_env import GymnaxEnv
     from mjx_walk.interop.trainer_envs import make_rsl_rl_env, make_sb3_env, make_torch_env
     from mjx_walk.machine.compat import prepare_jax
@@ -37,6 +41,8 @@ if TYPE_CHECKING:
 _WHERE = {
     "BraxEnv": "mjx_walk.interop.brax_env",
     "GymnaxEnv": "mjx_walk.interop.gymnax_env",
+    "from_brax": "mjx_walk.interop.from_brax",
+    "from_gymnax": "mjx_walk.interop.from_gymnax",
     "load_run": "mjx_walk.api",
     "make_env": "mjx_walk.envs",
     "make_rsl_rl_env": "mjx_walk.interop.trainer_envs",

@@ -12,10 +12,9 @@ from pathlib import Path
 import yaml
 
 from mjx_walk import zoo
-from mjx_walk.algos import Algorithm, make_algorithm
+from mjx_walk.algos import Algorithm, OffPolicyConfig, make_algorithm
 from mjx_walk.cli.parsing import refuse_flags
-from mjx_walk.envs import BUILT_IN_TASKS, Task, register_task
-from mjx_walk.envs.physics import resolve_engine
+from mjx_walk.envs import BUILT_IN_TASKS, TASKS, BaseTask, register_task, require_model
 from mjx_walk.envs.registry import task_name
 from mjx_walk.evaluation.gymnasium_scores import (
     Episodes,
@@ -38,6 +37,7 @@ from mjx_walk.storage.saved_yaml import read_yaml
 from mjx_walk.storage.scores import BEST, Scores
 from mjx_walk.training.checks import as_saved, check_replay, prepared
 from mjx_walk.training.distributed import Processes, per_device
+from mjx_walk.training.init_from import read_networks
 from mjx_walk.training.messages import announce
 from mjx_walk.training.trainer import Trainer
 from mjx_walk.utils.errors import UserError
@@ -94,7 +94,9 @@ class Run(SavedPolicy):
         return compile_episodes(self.task, deterministic_policy(self.algorithm, self.policy_params))
 
 
-def load_run(path: str | Path, physics: str | None = None, policy: str = BEST, task: type[Task] | None = None) -> Run:
+def load_run(
+    path: str | Path, physics: str | None = None, policy: str = BEST, task: type[BaseTask] | None = None
+) -> Run:
     """Load a run.
 
     Args:
@@ -102,7 +104,8 @@ def load_run(path: str | Path, physics: str | None = None, policy: str = BEST, t
         physics: engine to use instead of the run's own.
         policy: `best`, the policy with the highest evaluation during training or at its end, or `final`, the newest
             one. `eval` takes `final` by default; `play` and `export` take `best`, as here.
-        task: the run's task, if it is your own, and neither registered nor in a file that you trust.
+        task: the run's task, if it is your own or of another library, and neither registered nor in a file that you
+            trust.
 
     Raises:
         UserError: no run, or no usable policy at that path.
@@ -114,7 +117,7 @@ def load_run(path: str | Path, physics: str | None = None, policy: str = BEST, t
     return Run(folder, physics, policy)
 
 
-def _register_for(folder: RunFolder, task: type[Task]) -> None:
+def _register_for(folder: RunFolder, task: type[BaseTask]) -> None:
     """Register a task under the name that a run has for its own."""
     try:
         name = str(read_yaml(folder.config_copy() or folder.config).env.name)
@@ -178,17 +181,20 @@ def train(
         if configs[0].env.name not in BUILT_IN_TASKS and not configs[0].env.task:
             raise UserError(f"evaluation.films=true films in another process; name the task as {KEY}=FILE.py:CLASS")
         choose_opengl()
-    physics = resolve_engine(configs[0].physics)
+    physics = TASKS[configs[0].env.name][0].resolve_physics(configs[0].physics)
     configs = [dataclasses.replace(config, physics=physics) for config in configs]
     processes = processes or Processes()
     with temporary_jax_settings(configs[0].matmul_precision), contextlib.ExitStack() as closing:
         task = make_task(configs[0])
         closing.callback(task.engine.preparation.cancel)
+        if configs[0].evaluation.films:
+            require_model(task)
         if task.reward_hashes and processes.is_main_process:
             remember(configs[0].env.reward_function, task.reward_hashes)
         algorithm = _make_algorithm(configs[0], task, processes)
+        networks = read_networks(configs[0], algorithm)
         folders, configs = _prepare(configs, algorithm, processes, closing, runs)
-        trainer = Trainer(configs, algorithm, folders, processes, on_metrics)
+        trainer = Trainer(configs, algorithm, folders, processes, on_metrics, networks)
         with as_by_ctrl_c(), contextlib.closing(trainer):
             signal_name = trainer.train()
             if not signal_name:
@@ -198,9 +204,11 @@ def train(
     return folders, signal_name
 
 
-def _make_algorithm(config: Config, task: Task, processes: Processes) -> Algorithm:
+def _make_algorithm(config: Config, task: BaseTask, processes: Processes) -> Algorithm:
     """The algorithm of a run on this process's device."""
     evaluation, algo = (per_device(own, processes.process_count) for own in (config.evaluation, config.algo))
+    if config.init_from and isinstance(algo, OffPolicyConfig) and algo.random_steps is None:
+        algo = dataclasses.replace(algo, random_steps=0)  # its policy acts from the start
     return make_algorithm(task, config.num_envs, evaluation, algo, processes.axis_name)
 
 
@@ -248,7 +256,7 @@ def _resume_command(configs: list[Config], folders: list[RunFolder]) -> str:
 def run(
     overrides: list[str] | None = None,
     on_metrics: Callable[[Row], None] | None = None,
-    task: type[Task] | None = None,
+    task: type[BaseTask] | None = None,
 ) -> Run:
     """Train as `python -m mjx_walk.train` does, from Python.
 
@@ -257,7 +265,8 @@ def run(
     Args:
         overrides: arguments of the command, such as `["env=walker2d", "total_steps=1_000_000"]`.
         on_metrics: called with every logged row.
-        task: a class of your own to train on, in place of `env=`. `MyRobot` is registered as `my_robot`.
+        task: a class of your own to train on, in place of `env=`, or the result of `from_brax` or `from_gymnax`.
+            `MyRobot` is registered as `my_robot`.
 
     Raises:
         UserError: invalid overrides, or a run that cannot be trained here.
@@ -278,13 +287,18 @@ def _in_absolute_folder(config: Config) -> Config:
     return dataclasses.replace(config, run_dir=config.run_dir and str(Path(config.run_dir).absolute()))
 
 
-def _with_task(overrides: list[str], task: type[Task]) -> list[str]:
+def _with_task(overrides: list[str], task: type[BaseTask]) -> list[str]:
     """Register a task, and name it in the overrides. A resume takes the name from its saved configuration."""
     for override in overrides:
         if override.partition("=")[0] in ("env", KEY):
             raise UserError(f"give task= or {override}, not both")
     if isinstance(task, str):
         raise UserError(f"task={task!r}: give a class; for a task by its name, add 'env={task}' to the overrides")
+    if not isinstance(task, type):
+        raise UserError(
+            f"task= is an object of the class {type(task).__name__}: give a class; for an environment of another "
+            "library, give mjx_walk.from_brax(env) or mjx_walk.from_gymnax(env)"
+        )
     name = task_name(task)
     register_task(name, task)
     return overrides if "resume=true" in overrides else [f"env={name}", *overrides]

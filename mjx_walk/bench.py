@@ -7,7 +7,7 @@ from typing import Any
 
 from mjx_walk.api import resolve
 from mjx_walk.cli import parsing
-from mjx_walk.envs import Task
+from mjx_walk.envs import BaseTask
 from mjx_walk.evaluation.saved_policies import make_task
 from mjx_walk.experiments import scaling, timing
 from mjx_walk.experiments.timing import Measurement
@@ -74,7 +74,7 @@ def _measure(overrides: list[str], seconds: float) -> Iterator[Measurement]:
     yield Measurement("training", scaling.measure_speed(overrides, 1, seconds).steps_per_second, "env-steps/s")
 
 
-def describe_device(task: Task, config: Config) -> str:
+def describe_device(task: BaseTask, config: Config) -> str:
     """The device, the engine and the number of environments."""
     return f"{default_device().device_kind}, physics={task.engine.name}, {config.num_envs} environments"
 

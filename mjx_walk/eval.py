@@ -6,6 +6,7 @@ import warnings
 from mjx_walk import zoo
 from mjx_walk.api import Run, load_run
 from mjx_walk.cli import parsing
+from mjx_walk.envs import require_model
 from mjx_walk.evaluation.robustness import measure_robustness
 from mjx_walk.evaluation.saved_policies import default_policy, kept_policies
 from mjx_walk.settings.own_tasks import take_task
@@ -82,7 +83,7 @@ def _measure_robustness(arguments: Arguments, folder: RunFolder, policy: str) ->
         parsing.check_writable(path)
     run = load_run(folder.path, policy=policy)
     episodes = arguments.episodes or _EPISODES_OF_A_CELL
-    robustness = measure_robustness(run.task, run.act, episodes, arguments.seed)
+    robustness = measure_robustness(require_model(run.task), run.act, episodes, arguments.seed)
     print(
         f"{run.policy_name.capitalize()} policy (step {run.policy_metadata['env_steps']:,})",
         *robustness.lines(),

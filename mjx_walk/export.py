@@ -11,6 +11,7 @@ import mujoco
 from mjx_walk import __version__, zoo
 from mjx_walk.api import Run, load_run
 from mjx_walk.cli import parsing
+from mjx_walk.envs import require_model
 from mjx_walk.envs.motors import joint_of
 from mjx_walk.evaluation.saved_policies import kept_policies
 from mjx_walk.interop import hub_folder
@@ -131,8 +132,9 @@ def _export_minari(arguments: Arguments, folder: RunFolder) -> Run:
     root = get_dataset_path() if arguments.out is None else user_path(arguments.out)
     is_simulated = arguments.backend == "sim"
     run = load_run(folder.path, None if is_simulated else "c", arguments.policy or BEST)
+    task = require_model(run.task)
     if not is_simulated:
-        check_task(run.task)
+        check_task(task)
     path = root / dataset_id(run, arguments.backend)
     check_absent(path)
     parsing.check_writable(path)
@@ -189,7 +191,7 @@ def _film(run: Run, path: Path) -> bool:
     except UserError as error:
         print(f"without a film: {error}")
         return False
-    episode = record_episode(run.task, run.policy, 0, (640, 480))
+    episode = record_episode(require_model(run.task), run.policy, 0, (640, 480))
     write_film(episode.frames, path, episode.frames_per_second)
     return True
 
@@ -199,7 +201,8 @@ _EXPORTS = {"minari": _export_minari, "onnx": _export_onnx, "torch": _export_tor
 
 def _metadata(run: Run) -> dict[str, str]:
     """Facts that a program needs to use the policy, as text; lists, numbers and groups of options are JSON."""
-    task, model = run.task, run.task.model
+    task = require_model(run.task)
+    model = task.model
     keywords = task.gymnasium_kwargs()
     if "xml_file" in keywords:  # the folder may name the user
         keywords["xml_file"] = Path(str(keywords["xml_file"])).name

@@ -7,6 +7,7 @@ import imageio.v3 as iio
 from mjx_walk import zoo
 from mjx_walk.api import load_run
 from mjx_walk.cli import parsing
+from mjx_walk.envs import require_model
 from mjx_walk.settings.own_tasks import take_task
 from mjx_walk.storage.files import replacing, user_path
 from mjx_walk.storage.scores import BEST, POLICIES
@@ -82,7 +83,7 @@ def main(command_line: list[str]) -> None:
     run = load_run(folder.path, "c", arguments.policy)
     if written:
         size = None if written == [html] else (arguments.width, arguments.height)
-        episode = record_episode(run.task, run.policy, arguments.seed, size)
+        episode = record_episode(require_model(run.task), run.policy, arguments.seed, size)
         shown = _shown(arguments, float(episode.seconds[-1]))
         print(
             f"{run.policy_name.title()} policy (step {run.policy_metadata['env_steps']:,}), {episode.env}: "
@@ -99,7 +100,7 @@ def main(command_line: list[str]) -> None:
                 iio.imwrite(new, frame_strip(episode, *shown))
         print(*written, sep="\n")
     if arguments.viewer:
-        show(run.task, run.policy, arguments.seed)
+        show(require_model(run.task), run.policy, arguments.seed)
 
 
 def _shown(arguments: Arguments, length: float) -> tuple[float, float]:

@@ -66,6 +66,7 @@ RUN_BY_OTHER_TESTS = {
     "without_jax.py": "interop/test_onnx.py",
     "read_dataset.py": "interop/test_minari.py",
     "in_rejax.py": "interop/test_gymnax_env.py",
+    "brax_pendulum.py": "interop/test_external_runs.py",
     "huber_a2c.py": "test_examples.py",
 }
 
@@ -193,6 +194,7 @@ TRAINED_ELSEWHERE = {
     r"train env=humanoid algo=\w+$": "storage/test_old_runs.py",
     r"train .*\bseeds=": "training/test_seeds.py",
     r"train -m ": "test_train.py",
+    r"train env.task=brax_pendulum": "interop/test_external_runs.py",
 }
 """Commands with the test that trains so to the end. Here, they end when JAX has traced their programs."""
 
@@ -236,6 +238,7 @@ def test_every_command(line, small_run, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     exec(compile(file("heavy_torso.py"), "heavy_torso.py", "exec"), {})
     Path("go2.xml").write_text(small_robot())
+    Path("brax_pendulum.py").write_text(file("brax_pendulum.py"))
     if "own_robot.py" in line:
         pytest.importorskip("dm_control")
         shutil.copytree(CLONE / "docs" / "examples", "docs/examples")

@@ -17,6 +17,7 @@ class ToyTask(TrainableTask):
     reward_terms = ("reward_toy",)
     metric_names = ("reward_toy", "nonfinite", "overflow")
     observation_size = 1
+    dt = 0.01
 
     def __init__(self, max_episode_steps: int = 10):
         self.options = TaskOptions(name="toy", max_episode_steps=max_episode_steps)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from mjx_walk.envs.physics.preparation import Preparation
 from mjx_walk.machine.compat import standard_dtypes
 
-__all__ = ["Derived", "Engine", "PhysicsState", "batch_once"]
+__all__ = ["Derived", "Engine", "PhysicsState", "Simulator", "batch_once"]
 
 Derived = dict[str, Array]
 """MuJoCo arrays by their `mjData` names, for example `cinert`, `[nbody, 10] f32`."""
@@ -36,17 +36,21 @@ class PhysicsState(NamedTuple):
     """`[] i32`, which of the engine's changed models this is. None if the engine has one model."""
 
 
-class Engine(Protocol):
-    """A physics engine for one model, one number of substeps and one list of derived arrays.
-
-    Both methods are pure functions of one unbatched environment and support `jit`, `vmap` and `scan`.
-    """
+class Simulator(Protocol):
+    """What the trainer asks of whatever simulates a task."""
 
     name: str
     calls_host: bool
     """Whether it steps in a host callback. JAX does not cache compiled programs that contain one."""
     preparation: Preparation
-    """Work that must end before the engine's programs run."""
+    """Work that must end before its programs run."""
+
+
+class Engine(Simulator, Protocol):
+    """A physics engine for one model, one number of substeps and one list of derived arrays.
+
+    Both methods are pure functions of one unbatched environment and support `jit`, `vmap` and `scan`.
+    """
 
     def forward(self, state: PhysicsState) -> Derived:
         """Derived arrays of a new state at zero control. Source: Gymnasium's `set_state` (`mj_forward`).

@@ -7,7 +7,15 @@ from typing import Protocol
 
 from mjx_walk.machine import quiet_mjx  # noqa: F401  # isort: skip
 from mjx_walk.algos.a2c import A2C, A2CConfig
-from mjx_walk.algos.base import Algorithm, AlgorithmConfig, TrainState, is_finite, learned_leaves, without_replay
+from mjx_walk.algos.base import (
+    Algorithm,
+    AlgorithmConfig,
+    TrainState,
+    is_finite,
+    learned_leaves,
+    with_replay_of,
+    without_replay,
+)
 from mjx_walk.algos.csac import CSAC, CSACConfig
 from mjx_walk.algos.ddpg import DDPG, DDPGConfig
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
@@ -17,7 +25,7 @@ from mjx_walk.algos.reinforce import REINFORCE, REINFORCEConfig
 from mjx_walk.algos.sac import SAC, SACConfig
 from mjx_walk.algos.td3 import TD3, TD3Config
 from mjx_walk.common.inline_evaluation import EvaluationConfig
-from mjx_walk.envs import Task
+from mjx_walk.envs import BaseTask
 from mjx_walk.utils.class_checks import check_class, check_decorated
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import with_name
@@ -40,11 +48,13 @@ __all__ = [
     "BUILT_IN_ALGORITHMS",
     "Algorithm",
     "NamedConfig",
+    "OffPolicyConfig",
     "TrainState",
     "is_finite",
     "learned_leaves",
     "make_algorithm",
     "register_algorithm",
+    "with_replay_of",
     "without_replay",
 ]
 
@@ -57,7 +67,7 @@ class NamedConfig(AlgorithmConfig, Protocol):
 
 
 def make_algorithm(
-    task: Task, num_envs: int, evaluation: EvaluationConfig, config: NamedConfig, axis_name: str | None = None
+    task: BaseTask, num_envs: int, evaluation: EvaluationConfig, config: NamedConfig, axis_name: str | None = None
 ) -> Algorithm:
     """Build the algorithm whose settings `config` holds.
 
@@ -90,7 +100,7 @@ def register_algorithm(name: str, algorithm: type[Algorithm], config: type) -> N
     if name in BUILT_IN_ALGORITHMS:
         raise UserError(f"'{name}' is an algorithm of this package; choose another name")
     known = {other: kind for other, (kind, _) in ALGORITHMS.items()}
-    check_class("an algorithm", name, algorithm, Algorithm, "mjx_walk.algos", known)
+    check_class("an algorithm", name, algorithm, Algorithm, "a subclass of mjx_walk.algos.Algorithm", known)
     if not (isinstance(config, type) and issubclass(config, OnPolicyConfig | OffPolicyConfig)):
         raise UserError(f"the settings of '{name}' are {config!r}; derive them from OnPolicyConfig or OffPolicyConfig")
     check_decorated(config, f"settings of '{name}'")

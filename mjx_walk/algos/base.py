@@ -12,7 +12,7 @@ from jax import Array
 from jaxtyping import Bool, PRNGKeyArray
 
 from mjx_walk.common.inline_evaluation import EvaluationConfig, InlineEvaluation, InlineEvaluator
-from mjx_walk.envs import Task
+from mjx_walk.envs import BaseTask
 from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.envs.vector_env import VectorEnv, VectorState
 from mjx_walk.utils.types import (
@@ -25,7 +25,15 @@ from mjx_walk.utils.types import (
     leaves_with,
 )
 
-__all__ = ["Algorithm", "AlgorithmConfig", "TrainState", "is_finite", "learned_leaves", "without_replay"]
+__all__ = [
+    "Algorithm",
+    "AlgorithmConfig",
+    "TrainState",
+    "is_finite",
+    "learned_leaves",
+    "with_replay_of",
+    "without_replay",
+]
 
 
 class TrainState(flax.struct.PyTreeNode):
@@ -71,8 +79,16 @@ def is_finite(state: TrainState) -> Bool[Array, ""]:
 
 def without_replay(state: _StateT) -> _StateT:
     """A TrainState, or its shapes, without the replay buffer."""
-    fields = {field.name: () for field in dataclasses.fields(state) if field.metadata.get("replay")}
-    return state.replace(**fields)
+    return state.replace(**dict.fromkeys(_replay_fields(state), ()))
+
+
+def with_replay_of(other: _StateT, state: _StateT) -> _StateT:
+    """A TrainState with the replay buffer of another one."""
+    return state.replace(**{name: getattr(other, name) for name in _replay_fields(state)})
+
+
+def _replay_fields(state: TrainState) -> list[str]:
+    return [field.name for field in dataclasses.fields(state) if field.metadata.get("replay")]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -85,7 +101,7 @@ class Algorithm(abc.ABC, Generic[_StateT, _BatchT, _ConfigT]):
     `jit`; constants are built when it is constructed.
     """
 
-    task: Task
+    task: BaseTask
     """The unbatched environment."""
     num_envs: int
     """Environments that train, B."""
@@ -152,6 +168,10 @@ class Algorithm(abc.ABC, Generic[_StateT, _BatchT, _ConfigT]):
     @abc.abstractmethod
     def policy_params(self, state: _StateT) -> PolicyParams:
         """The part of the state that the policy needs, small enough to ship."""
+
+    @abc.abstractmethod
+    def with_policy(self, state: _StateT, policy_params: PolicyParams) -> _StateT:
+        """The state with another policy, which its evaluation does not know yet."""
 
     @abc.abstractmethod
     def policy(self, policy_params: PolicyParams, deterministic: bool = True) -> PolicyFn:

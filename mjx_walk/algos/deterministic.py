@@ -13,11 +13,11 @@ from jaxtyping import Float, PRNGKeyArray
 
 from mjx_walk.algos.off_policy import OffPolicyAlgorithm
 from mjx_walk.algos.off_policy_config import OffPolicyConfig
-from mjx_walk.algos.off_policy_state import Batch
+from mjx_walk.algos.off_policy_state import Batch, OffPolicyState
 from mjx_walk.common import networks
 from mjx_walk.common.optimizers import polyak_update
 from mjx_walk.utils.setting_fields import AnyBut, setting
-from mjx_walk.utils.types import Losses, Params
+from mjx_walk.utils.types import RESTARTS, Losses, Params, PolicyParams
 
 __all__ = ["DeterministicAlgorithm", "DeterministicConfig", "DeterministicState"]
 
@@ -30,7 +30,7 @@ class DeterministicConfig(OffPolicyConfig):
     """Std of the Gaussian noise on the first environment's actions, in `[-1, 1]`."""
     max_exploration_noise: float = setting(0.1, at_least=0, search="0.1,0.2,0.4,1.0")
     """Std for the last environment, evenly spaced in between: some environments explore, some stay near the policy."""
-    noise_repeat: int = setting(
+    noise_repeat: int | None = setting(
         1,
         at_least=1,
         only_if={
@@ -39,7 +39,10 @@ class DeterministicConfig(OffPolicyConfig):
             "learning_starts": AnyBut(0),
         },
     )
-    """Steps for which a sample of exploration noise, or a random action before learning starts, is kept."""
+    """Steps for which a sample of exploration noise, or a random action before learning starts, is kept.
+
+    If unset, those of about 64 ms.
+    """
 
 
 class DeterministicState(flax.struct.PyTreeNode):
@@ -49,8 +52,8 @@ class DeterministicState(flax.struct.PyTreeNode):
     critic: Params
     target_policy: Params
     target_critic: Params
-    policy_optimizer: optax.OptState
-    critic_optimizer: optax.OptState
+    policy_optimizer: optax.OptState = flax.struct.field(metadata=RESTARTS)
+    critic_optimizer: optax.OptState = flax.struct.field(metadata=RESTARTS)
 
 
 _DeterministicConfigT = TypeVar("_DeterministicConfigT", bound=DeterministicConfig)
@@ -76,6 +79,12 @@ class DeterministicAlgorithm(OffPolicyAlgorithm[DeterministicState, _Determinist
         policy, critic = networks.make_deterministic_networks(self.task, config, self.num_critics)
         noise = jnp.linspace(config.min_exploration_noise, config.max_exploration_noise, self.num_envs)[:, None]
         self._set(policy_network=policy, critic_network=critic, exploration_noise=noise)
+
+    def with_policy(
+        self, state: OffPolicyState[DeterministicState], policy_params: PolicyParams
+    ) -> OffPolicyState[DeterministicState]:
+        state = super().with_policy(state, policy_params)
+        return state.replace(learner=state.learner.replace(target_policy=state.learner.policy))
 
     @property
     def target_noise(self) -> tuple[float, float]:

@@ -28,6 +28,11 @@ __all__ = ["OffPolicyAlgorithm"]
 _OffPolicyConfigT = TypeVar("_OffPolicyConfigT", bound=OffPolicyConfig)
 _ParamsT = TypeVar("_ParamsT")
 
+_NOISE_SECONDS = 0.064
+"""Time for which a sample of exploration noise is kept, by default: a fraction of a stride."""
+_TARGET_SECONDS = 0.04
+"""Time whose rewards a critic's target sums up, by default."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OffPolicyAlgorithm(
@@ -43,9 +48,17 @@ class OffPolicyAlgorithm(
 
     buffer: ReplayBuffer = dataclasses.field(init=False, repr=False)
     optimizer: optax.GradientTransformation = dataclasses.field(init=False, repr=False)
+    n_step: int = dataclasses.field(init=False)
+    """Steps whose rewards a critic's target sums up."""
+    noise_repeat: int = dataclasses.field(init=False)
+    """Steps for which a sample of exploration noise is kept."""
 
     def __post_init__(self) -> None:
         config = self.config
+        self._set(
+            n_step=config.n_step or steps_of(_TARGET_SECONDS, self.task.dt),
+            noise_repeat=config.noise_repeat or steps_of(_NOISE_SECONDS, self.task.dt),
+        )
         if self.updates_per_iteration % config.policy_delay:
             raise UserError(
                 f"algo.grad_updates_per_step={config.grad_updates_per_step} times "
@@ -53,7 +66,7 @@ class OffPolicyAlgorithm(
                 f"algo.policy_delay={config.policy_delay}"
             )
         num_unrolls = max(
-            -(-config.replay_capacity // self.steps_per_iteration), -(-(config.n_step + 1) // config.unroll_length)
+            -(-config.replay_capacity // self.steps_per_iteration), -(-(self.n_step + 1) // config.unroll_length)
         )
         num_rows = num_unrolls * config.unroll_length
         self._set(buffer=ReplayBuffer(self.task, self.num_envs, num_rows, config.replay_dtype))
@@ -103,9 +116,15 @@ class OffPolicyAlgorithm(
         return self.config.grad_updates_per_step * self.config.unroll_length
 
     @property
+    def num_random_steps(self) -> int:
+        """Environment steps with uniformly random actions."""
+        given = self.config.random_steps
+        return self.config.learning_starts if given is None else given
+
+    @property
     def rows_before_learning(self) -> int:
         """Steps of all environments before the first update."""
-        return max(-(-self.config.learning_starts // self.num_envs), self.config.n_step + 1)
+        return max(-(-self.config.learning_starts // self.num_envs), self.n_step + 1)
 
     @property
     def replay_bytes(self) -> int:
@@ -125,6 +144,10 @@ class OffPolicyAlgorithm(
 
     def policy_params(self, state: OffPolicyState[LearnerT]) -> PolicyParams:
         return (state.normalizer, state.learner.policy)
+
+    def with_policy(self, state: OffPolicyState[LearnerT], policy_params: PolicyParams) -> OffPolicyState[LearnerT]:
+        normalizer, policy = policy_params
+        return state.replace(normalizer=normalizer, learner=state.learner.replace(policy=policy))
 
     def policy(self, policy_params: PolicyParams, deterministic: bool = True) -> PolicyFn:
         normalizer, params = policy_params
@@ -157,7 +180,7 @@ class OffPolicyAlgorithm(
         config = self.config
         key, pool_key = jax.random.split(state.key)
         step = state.iterations * config.unroll_length + jnp.arange(config.unroll_length)
-        noise_keys = jax.vmap(jax.random.fold_in, (None, 0))(state.noise_key, step // config.noise_repeat)
+        noise_keys = jax.vmap(jax.random.fold_in, (None, 0))(state.noise_key, step // self.noise_repeat)
         env, evaluation, scores = self.start_iteration(state, pool_key)
         actor = functools.partial(self._explore, state)
         env, evaluation, steps, metrics = rollout.unroll(
@@ -169,7 +192,7 @@ class OffPolicyAlgorithm(
         self, state: OffPolicyState[LearnerT], obs: Float[Array, "B observation_size"], key: PRNGKeyArray
     ) -> tuple[Float[Array, "B action_size"], Float[Array, "B action_size"]]:
         """Gymnasium's action and the networks'; uniformly random before learning starts."""
-        is_random = state.iterations * float(self.steps_per_iteration) < self.config.learning_starts
+        is_random = state.iterations * float(self.steps_per_iteration) < self.num_random_steps
         explore_key, uniform_key = jax.random.split(key)
         chosen = self.explore(state.learner.policy, self.normalize(state.normalizer, obs), explore_key)
         uniform = jax.random.uniform(uniform_key, chosen.shape, minval=-1.0, maxval=1.0)
@@ -241,7 +264,7 @@ class OffPolicyAlgorithm(
         # Sampled and normalized at once: on a GPU, small updates wait for the launch of their kernels.
         sample_key, key = jax.random.split(key)
         num_transitions = self.updates_per_iteration * config.batch_size
-        sampled = self.buffer.sample(replay, sample_key, num_transitions, config.n_step, discount)
+        sampled = self.buffer.sample(replay, sample_key, num_transitions, self.n_step, discount)
         sampled = sampled._replace(
             observation=self.normalize(normalizer, sampled.observation),
             next_observation=self.normalize(normalizer, sampled.next_observation),
@@ -261,3 +284,13 @@ def _wait(train: Callable[[LearnerT], tuple[LearnerT, Losses]], learner: Learner
     """The unchanged learner, and zeros for metrics, before learning starts."""
     shapes = jax.eval_shape(train, learner)[1]
     return learner, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+
+def steps_of(seconds: float, dt: float) -> int:
+    """Control steps that take about so long, at least one.
+
+    Args:
+        seconds: time, s.
+        dt: time of a step, s.
+    """
+    return max(1, round(seconds / dt))

@@ -25,11 +25,13 @@ class OffPolicyConfig:
     replay_dtype: str = setting("float32", choices=("float32", "bfloat16"))
     """Dtype of the stored observations."""
     learning_starts: int = setting(10_000, at_least=0)
-    """Environment steps with uniformly random actions, before learning starts."""
-    noise_repeat: int = setting(1, at_least=1)
-    """Steps for which a sample of exploration noise is kept."""
-    n_step: int = setting(1, at_least=1, search="1,3,5")
-    """Steps whose rewards a critic's target sums up."""
+    """Environment steps before learning starts."""
+    random_steps: int | None = setting(None, at_least=0)
+    """Environment steps with uniformly random actions. If unset, `learning_starts`, or none with `init_from`."""
+    noise_repeat: int | None = setting(1, at_least=1)
+    """Steps for which a sample of exploration noise is kept. If unset, those of about 64 ms."""
+    n_step: int | None = setting(1, at_least=1, search="1,3,5")
+    """Steps whose rewards a critic's target sums up. If unset, those of about 40 ms."""
     discount: float = setting(0.99, at_least=0, at_most=1, search="0.95,0.97,0.98,0.99,0.995,0.999")
     """Discount factor γ of one step."""
     final_discount: float | None = setting(None, at_least=0, below=1)

@@ -1,6 +1,6 @@
 """The state of off-policy algorithms, and the batch of one of their updates."""
 
-from typing import Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
 
 import flax
 from brax.training.acme.running_statistics import RunningStatisticsState
@@ -9,7 +9,7 @@ from jax import Array
 from mjx_walk.algos.base import TrainState
 from mjx_walk.common import returns
 from mjx_walk.common.replay_buffer import Replay
-from mjx_walk.utils.types import RANDOM_KEY, REPLAY, Params, Transition
+from mjx_walk.utils.types import RANDOM_KEY, REPLAY, RESTARTS, Params, Transition
 
 __all__ = ["Batch", "Learner", "LearnerT", "OffPolicyState"]
 
@@ -35,6 +35,10 @@ class Learner(Protocol):
         """Parameters of the policy."""
         ...
 
+    def replace(self, **changes: object) -> Self:
+        """A copy with other fields."""
+        ...
+
 
 LearnerT = TypeVar("LearnerT", bound=Learner)
 
@@ -44,7 +48,7 @@ class OffPolicyState(TrainState, Generic[LearnerT]):
 
     learner: LearnerT
     """Networks and optimizers."""
-    critic_updates: Array
+    critic_updates: Array = flax.struct.field(metadata=RESTARTS)
     """`[] i32`: critic updates so far."""
     normalizer: RunningStatisticsState
     return_scale: returns.ReturnScale

@@ -23,7 +23,7 @@ from mjx_walk.common.exploration import Exploration, NoExploration
 from mjx_walk.common.optimizers import adapt_rate, apply_gradients, make_adam, remaining_fraction, schedule_factor
 from mjx_walk.utils import collectives
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.types import PER_DEVICE, Metrics, PolicyFn, PolicyParams, Transition
+from mjx_walk.utils.types import PER_DEVICE, RESTARTS, Metrics, PolicyFn, PolicyParams, Transition
 
 __all__ = ["OnPolicyAlgorithm", "OnPolicyBatch", "OnPolicyState", "require_several_gradient_steps"]
 
@@ -34,8 +34,8 @@ class OnPolicyState(TrainState):
     """State of an on-policy algorithm."""
 
     params: PPOParams
-    optimizer: optax.OptState
-    learning_rate: Array
+    optimizer: optax.OptState = flax.struct.field(metadata=RESTARTS)
+    learning_rate: Array = flax.struct.field(metadata=RESTARTS)
     """`[] f32`: of the policy; constant unless it adapts to the KL."""
     normalizer: RunningStatisticsState
     return_scale: returns.ReturnScale
@@ -97,6 +97,10 @@ class OnPolicyAlgorithm(Algorithm[OnPolicyState, OnPolicyBatch, _OnPolicyConfigT
 
     def policy_params(self, state: OnPolicyState) -> PolicyParams:
         return (state.normalizer, state.params.policy)
+
+    def with_policy(self, state: OnPolicyState, policy_params: PolicyParams) -> OnPolicyState:
+        normalizer, policy = policy_params
+        return state.replace(normalizer=normalizer, params=state.params.replace(policy=policy))
 
     def policy(self, policy_params: PolicyParams, deterministic: bool = True) -> PolicyFn:
         act = brax_ppo_networks.make_inference_fn(self.nets)(policy_params, deterministic=deterministic)

@@ -17,7 +17,7 @@ from mjx_walk.common import networks
 from mjx_walk.common.brax_losses import SACLosses, make_sac_losses
 from mjx_walk.common.optimizers import polyak_update
 from mjx_walk.utils.setting_fields import AnyBut, setting
-from mjx_walk.utils.types import Losses, Params
+from mjx_walk.utils.types import RESTARTS, Losses, Params
 
 __all__ = ["SAC", "SACConfig", "SACState"]
 
@@ -54,9 +54,9 @@ class SACState(flax.struct.PyTreeNode):
     critic: Params
     target_critic: Params
     log_alpha: Array
-    policy_optimizer: optax.OptState
-    critic_optimizer: optax.OptState
-    alpha_optimizer: optax.OptState
+    policy_optimizer: optax.OptState = flax.struct.field(metadata=RESTARTS)
+    critic_optimizer: optax.OptState = flax.struct.field(metadata=RESTARTS)
+    alpha_optimizer: optax.OptState = flax.struct.field(metadata=RESTARTS)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_walk.envs import State, Task
+from mjx_walk.envs import BaseTask, State
 from mjx_walk.envs.vector_env import Outcome, VectorEnv, VectorState
 from mjx_walk.utils.setting_fields import setting
 from mjx_walk.utils.types import ITERATION_COUNT, Metric, Metrics, PolicyFn, PolicyParams, Reduction
@@ -64,7 +64,7 @@ class InlineEvaluator:
 
     def __init__(
         self,
-        task: Task,
+        task: BaseTask,
         num_train_envs: int,
         config: EvaluationConfig,
         policy: Callable[[PolicyParams], PolicyFn],

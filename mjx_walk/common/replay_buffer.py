@@ -9,7 +9,7 @@ from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
 from mjx_walk.common.returns import n_step_return
-from mjx_walk.envs import Task
+from mjx_walk.envs import BaseTask
 from mjx_walk.machine.devices import num_bytes
 from mjx_walk.utils.types import Transition
 
@@ -57,7 +57,7 @@ class Steps(flax.struct.PyTreeNode):
 class ReplayBuffer:
     """Functions on a `Replay` of one size."""
 
-    task: Task
+    task: BaseTask
     num_envs: int
     num_rows: int
     observation_dtype: str = "float32"

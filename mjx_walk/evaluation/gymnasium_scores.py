@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mjx_walk.common.rollout import evaluate
-from mjx_walk.envs import Task
+from mjx_walk.envs import BaseTask, Task, require_model
 from mjx_walk.envs.randomization.options import Randomization
 from mjx_walk.evaluation.gymnasium_episodes import MAX_PARALLEL_EPISODES, ParallelEpisodes, warn_of_differences
 from mjx_walk.evaluation.perturbations import Perturbation
@@ -35,7 +35,7 @@ Episodes = Callable[[jax.Array, int], tuple[jax.Array, jax.Array, dict[str, jax.
 """`key, N → returns [N] f32, lengths [N] i32, means of the task's measures [N] f32`."""
 
 
-def score_in_gymnasium(task: Task, act: Act, num_episodes: int, seed: int = 0) -> Scores:
+def score_in_gymnasium(task: BaseTask, act: Act, num_episodes: int, seed: int = 0) -> Scores:
     """Score complete episodes in `gymnasium.make`: MuJoCo on the CPU, in float64, with the model's own solver.
 
     One process per core plays the episodes. A task without an equivalent in Gymnasium is scored in its own engine,
@@ -51,11 +51,11 @@ def score_in_gymnasium(task: Task, act: Act, num_episodes: int, seed: int = 0) -
         UserError: the model file is gone.
     """
     if not task.is_in_gymnasium:
-        if task.randomizer.is_on:
+        if isinstance(task, Task) and task.randomizer.is_on:
             task = type(task)(dataclasses.replace(task.options, randomize=Randomization()), task.engine.name)
         return score_in_sim(task, compile_episodes(task, lambda obs, key: act(obs)), num_episodes, seed)
     seeds = [int(seed) + i for i in range(num_episodes)]  # Gymnasium refuses NumPy's integers
-    returns, lengths = play_in_gymnasium(task, act, seeds)
+    returns, lengths = play_in_gymnasium(require_model(task), act, seeds)
     return Scores(returns, lengths, seeds, task.gymnasium_id)
 
 
@@ -101,12 +101,12 @@ def _play_round(
     return returns, lengths
 
 
-def compile_episodes(task: Task, policy: PolicyFn) -> Episodes:
+def compile_episodes(task: BaseTask, policy: PolicyFn) -> Episodes:
     """Compile complete episodes in the task's own engine, once for each number of episodes."""
     return jax.jit(lambda key, num_episodes: evaluate(task, num_episodes, policy, key), static_argnums=1)
 
 
-def score_in_sim(task: Task, episodes: Episodes, num_episodes: int, seed: int = 0) -> Scores:
+def score_in_sim(task: BaseTask, episodes: Episodes, num_episodes: int, seed: int = 0) -> Scores:
     """Score complete episodes in the task's own engine, all in one batch.
 
     Args:
@@ -118,7 +118,8 @@ def score_in_sim(task: Task, episodes: Episodes, num_episodes: int, seed: int = 
     with undisturbed("finishing the episodes"):
         found = jax.block_until_ready(episodes(jax.random.PRNGKey(seed), num_episodes))
     returns, lengths, measures = jax.tree.map(np.asarray, found)
-    name = f"{task.gymnasium_id} on {task.engine.name}" + (", on hills" if task.ground.is_on else "")
+    on_hills = isinstance(task, Task) and task.ground.is_on
+    name = f"{task.gymnasium_id} on {task.engine.name}" + (", on hills" if on_hills else "")
     if measures and task.terminates_on_fall:
         measures["falls (%)"] = 100 * (lengths < task.max_episode_steps)
     means = {measure: np.asarray(values, np.float64) for measure, values in measures.items()}

@@ -13,8 +13,7 @@ import numpy as np
 
 from mjx_walk.algos import Algorithm, TrainState, make_algorithm, without_replay
 from mjx_walk.common.inline_evaluation import NO_RETURN
-from mjx_walk.envs import TASKS, Task
-from mjx_walk.envs.physics import resolve_engine
+from mjx_walk.envs import TASKS, BaseTask
 from mjx_walk.envs.pickling import ReadFiles, files_of, warn_of_changed_files
 from mjx_walk.envs.randomization.options import Randomization
 from mjx_walk.machine.compat import standard_settings
@@ -74,7 +73,7 @@ class SavedPolicy:
         self.policy_params, self.policy_metadata = _load(folder, self.policy_name, self.algorithm)
 
     def _build(self) -> None:
-        config, engine = self.config, self._physics or _engine_here(self.config.physics)
+        config, engine = self.config, self._physics or _engine_here(self.config)
         self.task = make_task(dataclasses.replace(config, physics=engine))
         self.algorithm = in_float32(make_algorithm(self.task, config.num_envs, config.evaluation, config.algo))
 
@@ -92,11 +91,11 @@ class SavedPolicy:
 
     @functools.cached_property
     def command(self) -> str:
-        """The command that trained the policy. It names a reward function's file without the user's folders."""
+        """The command that trained the policy. It names files and another run without the user's folders."""
         saved = read_saved_config(RunFolder(self.path))
-        own = saved.env.reward_function
+        own, source = saved.env.reward_function, saved.init_from
         env = dataclasses.replace(saved.env, reward_function=own and Path(own).name)
-        return training_command(dataclasses.replace(saved, env=env))
+        return training_command(dataclasses.replace(saved, env=env, init_from=source and Path(source).name))
 
     @functools.cached_property
     def act(self) -> Act:
@@ -123,7 +122,7 @@ class SavedPolicy:
         return np.asarray(self.act(obs))
 
 
-def make_task(config: Config) -> Task:
+def make_task(config: Config) -> BaseTask:
     """Build the unbatched environment of a configuration."""
     return TASKS[config.env.name][0](config.env, config.physics)
 
@@ -242,10 +241,10 @@ def best_policy(state: TrainState, steps_per_iteration: int) -> tuple[PolicyPara
     return evaluation.best_policy_params, {"env_steps": env_steps, "eval_return": float(evaluation.best_return)}
 
 
-def _engine_here(name: str) -> str:
+def _engine_here(config: Config) -> str:
     """The engine that a run was trained on, or `auto` if this machine does not support it."""
     try:
-        return resolve_engine(name)
+        return TASKS[config.env.name][0].resolve_physics(config.physics)
     except UserError:
         return "auto"
 

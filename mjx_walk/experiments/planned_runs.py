@@ -15,7 +15,7 @@ from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from mjx_walk.envs.physics import resolve_engine
+from mjx_walk.envs import TASKS
 from mjx_walk.logs.metrics import read_rows
 from mjx_walk.machine.devices import only_device
 from mjx_walk.machine.signals import Interrupt
@@ -149,7 +149,8 @@ def _check_same_configuration(run: PlannedRun) -> None:
     if not run.folder.is_run:
         return
     saved = read_saved_config(run.folder)
-    differing = differences(saved, dataclasses.replace(run.config, physics=resolve_engine(run.config.physics)))
+    physics = TASKS[run.config.env.name][0].resolve_physics(run.config.physics)
+    differing = differences(saved, dataclasses.replace(run.config, physics=physics))
     if run.config.total_steps < saved.total_steps:
         differing.append("total_steps, which may only grow")
     if differing:

@@ -117,7 +117,9 @@ def _shared_programs(key: _Key) -> Programs:
 
 
 def _new_programs(options: TaskOptions, engine: str) -> Programs:
-    return Programs(TASKS[options.name][0](options, engine, keep_info=True))
+    kind = TASKS[options.name][0]
+    assert issubclass(kind, Task)  # Gymnasium's registry has no others
+    return Programs(kind(options, engine, keep_info=True))
 
 
 def _split_each(keys: jax.Array) -> tuple[jax.Array, jax.Array]:

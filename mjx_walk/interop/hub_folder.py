@@ -74,6 +74,7 @@ def write_run(path: Path, saved: SavedPolicy, scores: Scores, command: str) -> N
     """
     folder = RunFolder(path)
     config = dataclasses.replace(saved.config, physics="auto", run_dir=None, resume=False, wandb_project=None)
+    config.init_from = config.init_from and Path(config.init_from).name
     save_config(config, folder.config)
     checkpoint.save(folder.policy(BEST), saved.policy_params, saved.policy_metadata, as_numpy=True)
     block = scores.block(**saved.policy_metadata)

@@ -19,7 +19,7 @@ from minari.dataset.minari_storage import MinariStorage
 from minari.namespace import NAMESPACE_METADATA_FILENAME
 
 from mjx_walk import zoo
-from mjx_walk.envs import Task
+from mjx_walk.envs import Task, require_model
 from mjx_walk.envs.model_files import is_asset
 from mjx_walk.evaluation.recorded_episodes import RecordedEpisode, record_episodes
 from mjx_walk.evaluation.saved_policies import SavedPolicy, deterministic_policy
@@ -120,7 +120,7 @@ def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int, 
 
 def _write(folder: Path, saved: SavedPolicy, num_episodes: int, seed: int, backend: str) -> Scores:
     """Write the files of a dataset."""
-    task = saved.task
+    task = require_model(saved.task)
     storage = _new_storage(folder, task)
     if backend == "sim":
         seeds, name = [seed], f"{task.gymnasium_id} on {task.engine.name}"

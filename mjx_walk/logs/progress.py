@@ -135,7 +135,7 @@ class Progress:
             self._bar.has_time_left = not self._is_filling  # learning is slower
         self.show_stage("filling the replay" if self._is_filling else "training")
         if self._is_filling and not was_filling and not self._is_terminal:
-            _LOGGER.info("Filling the replay with random actions, before learning starts")
+            _LOGGER.info("Filling the replay, before learning starts")
         self._evaluated = row.get("eval/return", self._evaluated)
         if self._is_terminal:
             self._bar.set_postfix(self._scores(row), refresh=False)

@@ -19,6 +19,7 @@ from mjx_walk.settings.recipe_files import with_paths, with_stored_recipes
 from mjx_walk.settings.recipes import CONFIG_DIR, recipe_names
 from mjx_walk.settings.schema import CheckpointConfig, Config, leaves
 from mjx_walk.storage.files import user_path, working_folder
+from mjx_walk.storage.run_folder import PREFIX
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import has_effect, refuse_ineffective, validate
 
@@ -110,7 +111,11 @@ def with_absolute_paths(config: Config, folder: Path) -> Config:
         UserError: a path has `${`, which a saved configuration cannot hold.
     """
     run_dir = str(user_path(config.run_dir)) if config.run_dir is not None else None
-    config = dataclasses.replace(config, run_dir=run_dir, env=envs.with_absolute_paths(config.env, folder))
+    source = config.init_from
+    if source and not source.startswith(PREFIX):
+        source = str(folder / user_path(source))
+    env = envs.with_absolute_paths(config.env, folder)
+    config = dataclasses.replace(config, run_dir=run_dir, init_from=source, env=env)
     for key, value in flatten(config).items():
         if isinstance(value, str) and "${" in value:
             raise UserError(f"{key}={value}: '${{' names another setting; choose a name without it")

@@ -7,7 +7,7 @@ import shlex
 import warnings
 from pathlib import Path
 
-from mjx_walk.envs import TASKS, Task, TaskOptions
+from mjx_walk.envs import TASKS, BaseTask, TaskOptions
 from mjx_walk.envs.model_files import changed_names, model_path, source_hashes
 from mjx_walk.envs.registry import task_hashes
 from mjx_walk.envs.user_files import source_path
@@ -35,7 +35,7 @@ Inputs = dict[str, dict[str, str]]
 Gymnasium's own model counts for `env.xml_file`."""
 
 
-def read_inputs(task: Task) -> Inputs:
+def read_inputs(task: BaseTask) -> Inputs:
     """The files that a task has read."""
     options = task.options
     inputs = {_MODEL: task.model_sources}

@@ -72,7 +72,7 @@ def find_saved_task(name: object, source: str | None, config: Path) -> None:
     if not source:
         raise UserError(
             f"the task '{name}' of {config} is not registered; add {KEY}=FILE.py:CLASS to the command, or pass "
-            "task=CLASS to load_run"
+            "task=CLASS to run or load_run"
         )
     require_trusted(source, KEY)
     found = register_task_file(source)

@@ -37,7 +37,7 @@ __all__ = [
 
 MAY_DIFFER = (
     *("run_dir", "resume", "total_steps", "algo.schedule_steps"),
-    *("wandb_project", "evaluation.films", "profile_calls"),
+    *("wandb_project", "evaluation.films", "profile_calls", "stop_at_return"),
 )
 """Settings that may change when a run is resumed."""
 _LENGTHS = ("total_steps", "algo.schedule_steps")

@@ -50,6 +50,10 @@ class Config:
     """Folder of the run, by default `runs/ENV_ALGO/TIME`."""
     resume: bool = False
     """Continue the run in `run_dir` from its newest checkpoint."""
+    init_from: str | None = None
+    """Run folder or zoo:NAME whose networks the training begins with, with new optimizers and schedules."""
+    stop_at_return: float | None = None
+    """Mean return of an evaluation during training that ends it. With several seeds, each of them must reach it."""
     wandb_project: str | None = None
     """Weights & Biases project to log to."""
     profile_calls: int = setting(0, at_least=0)

@@ -12,8 +12,10 @@ from mjx_walk.storage.files import user_path
 from mjx_walk.storage.scores import BEST, FINAL
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["RunFolder", "new_folder", "open_existing"]
+__all__ = ["PREFIX", "RunFolder", "new_folder", "open_existing"]
 
+PREFIX = "zoo:"
+"""Start of the name of a policy that the package ships, which stands in place of a run folder."""
 _MOST_IN_A_SECOND = 10_000
 
 

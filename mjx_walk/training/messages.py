@@ -3,15 +3,18 @@
 import logging
 import shlex
 from collections.abc import Mapping
-from pathlib import Path
 
+import jax.numpy as jnp
+
+from mjx_walk.algos import TrainState, learned_leaves
+from mjx_walk.envs import TASKS, Task
 from mjx_walk.machine.devices import default_device
 from mjx_walk.settings.config import Config
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import BEST, FINAL, Scores
 from mjx_walk.utils.text import duration
 
-__all__ = ["announce", "choice_line", "end_lines", "score_lines"]
+__all__ = ["announce", "choice_line", "divergence", "end_lines", "score_lines"]
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -30,7 +33,7 @@ def announce(config: Config, folders: list[RunFolder], num_devices: int) -> None
     path = folders[0].path if len(folders) == 1 else f"{len(folders)} folders of {folders[0].path.parent}"
     env, algo = config.env.name, config.algo
     _LOGGER.info("Training %s with %s on %s, physics=%s, in %s", env, algo.name, where, config.physics, path)
-    if config.hardware == "cpu":
+    if config.hardware == "cpu" and issubclass(TASKS[env][0], Task):
         _LOGGER.info(
             "JAX runs on the CPU: this is the recipe for a CPU. By default the physics is MuJoCo's C library. "
             "Expect a gait after minutes to tens of minutes; recipes for a GPU reach much higher scores."
@@ -47,6 +50,24 @@ def announce(config: Config, folders: list[RunFolder], num_devices: int) -> None
         _LOGGER.info("On the first run on a machine, Warp compiles its kernels, which takes half a minute or more.")
         if config.profile_calls > 1 and num_devices == 1:
             _LOGGER.warning("JAX's profiler has hung in a second recorded call of Warp on one GPU; use profile_calls=1")
+
+
+def divergence(states: list[TrainState], seeds: list[int], env_steps: int) -> str:
+    """Name the runs that have diverged, each with its first learned leaf that is not finite.
+
+    Args:
+        states: of the runs that train together, without the replay.
+        seeds: their seeds.
+        env_steps: their environment steps.
+    """
+    found = []
+    for seed, state in zip(seeds, states, strict=True):
+        names = [name for name, leaf in learned_leaves(state).items() if not jnp.isfinite(leaf).all()]
+        found += [f"{name} of seed {seed}" for name in names[:1]]
+    return (
+        f"training has diverged: after {env_steps:,} steps {', '.join(found)} is not finite; "
+        "earlier checkpoints are kept; start a new run with a lower learning rate, or clip gradients"
+    )
 
 
 def score_lines(
@@ -81,7 +102,9 @@ def choice_line(taken: str) -> str:
     return f"The best policy has the highest evaluation during training. eval scores the final one: policy={FINAL}"
 
 
-def end_lines(folders: list[Path], training_seconds: float, total_seconds: float, is_scored: bool) -> list[str]:
+def end_lines(
+    folders: list[RunFolder], training_seconds: float, total_seconds: float, is_scored: bool, has_model: bool
+) -> list[str]:
     """The time, the folder, and the next command.
 
     Args:
@@ -89,12 +112,18 @@ def end_lines(folders: list[Path], training_seconds: float, total_seconds: float
         training_seconds: seconds of training, without scoring.
         total_seconds: seconds of training and scoring.
         is_scored: whether the policies were scored.
+        has_model: whether the task has a model to draw.
     """
     time = duration(total_seconds)
     if is_scored:
         time = f"{time}, of which training took {duration(training_seconds)}"
-    where = str(folders[0]) if len(folders) == 1 else f"{len(folders)} folders of {folders[0].parent}"
-    next_step = (
-        "To watch the best policy: python -m mjx_walk.play" if is_scored else "To score: python -m mjx_walk.eval"
-    )
-    return [f"Finished in {time}. The results are in {where}", f"{next_step} {shlex.quote(f'run={folders[0]}')}"]
+    path = folders[0].path
+    where = str(path) if len(folders) == 1 else f"{len(folders)} folders of {path.parent}"
+    run = shlex.quote(f"run={path}")
+    if not has_model:
+        next_step = f"To load the best policy: mjx_walk.load_run({str(path)!r}, task=…)"
+    elif is_scored:
+        next_step = f"To watch the best policy: python -m mjx_walk.play {run}"
+    else:
+        next_step = f"To score: python -m mjx_walk.eval {run}"
+    return [f"Finished in {time}. The results are in {where}", next_step]

@@ -7,9 +7,8 @@ import time
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 
-from mjx_walk.algos import Algorithm, TrainState, learned_leaves, without_replay
+from mjx_walk.algos import Algorithm, TrainState, without_replay
 from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.envs.vector_env import check_resets
 from mjx_walk.evaluation.saved_policies import in_float32
@@ -22,7 +21,9 @@ from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import BEST, FINAL
 from mjx_walk.training.call_profile import CallProfile
 from mjx_walk.training.distributed import Processes
-from mjx_walk.training.messages import end_lines, score_lines
+from mjx_walk.training.goal import Goal
+from mjx_walk.training.init_from import Networks, begin_with
+from mjx_walk.training.messages import divergence, end_lines, score_lines
 from mjx_walk.training.programs import compile_together, make_program
 from mjx_walk.training.recorder import Recorder
 from mjx_walk.training.restoring import restore_runs
@@ -46,6 +47,7 @@ class Trainer:
         folders: list[RunFolder],
         processes: Processes,
         on_metrics: Callable[[Row], None] | None = None,
+        networks: Networks | None = None,
     ):
         """
         Args:
@@ -54,6 +56,7 @@ class Trainer:
             folders: prepared run folders, one for each configuration.
             processes: processes that train one run together, with `num_envs` environments each.
             on_metrics: called with every logged row.
+            networks: what a new run begins with, by default random networks.
         """
         self._config = config = configs[0]
         self._algorithm = algorithm
@@ -73,6 +76,8 @@ class Trainer:
         self._seeds = [own.seed for own in configs]
         self._keys = [jax.random.PRNGKey(seed) for seed in self._seeds]
         self._on_metrics = on_metrics or (lambda row: None)
+        self._networks = networks
+        self._goal = Goal(config.stop_at_return, len(configs))
         self._policies: list[Policies] = []
         """Policies of each run after a complete training, in the main process."""
         self._started = time.monotonic()
@@ -101,12 +106,13 @@ class Trainer:
         saved_call, is_finite = call if restored is not None else None, True
         with Interrupt() as interrupt, profile:
             signal_name = self._stop_signal(interrupt)
-            while call < self._num_calls and is_finite and not signal_name:
+            while call < self._num_calls and is_finite and not signal_name and not self._goal.is_reached:
                 profile.next_call()
                 state, metrics = self._program.run_call(state)
                 call += 1
                 rows = self._rows(call, metrics, speed)
                 self._log(rows)
+                self._goal.take(rows, is_main)
                 self._film(state, rows)
                 progress.update(mean_row(rows))
                 is_finite = bool(self._program.is_finite(state).all())
@@ -120,7 +126,8 @@ class Trainer:
         progress.close()
         self._finish(state, call, is_finite, is_complete=is_finite and not signal_name)
         if not is_finite:
-            raise UserError(self._divergence(state, call))
+            states = self._program.split(without_replay(state))
+            raise UserError(divergence(states, self._seeds, self._env_steps(call)))
         return signal_name
 
     def score(self) -> None:
@@ -139,8 +146,8 @@ class Trainer:
                 self._score_runs(num_episodes, seconds)
         finally:
             self._wait_for_files()
-        paths = [folder.path for folder in self._folders]
-        for line in end_lines(paths, seconds, self._seconds(), bool(num_episodes)) if is_main else ():
+        lines = end_lines(self._folders, seconds, self._seconds(), bool(num_episodes), bool(task.model_file))
+        for line in lines if is_main else ():
             _LOGGER.info(line)
 
     def close(self) -> None:
@@ -188,7 +195,10 @@ class Trainer:
             return restored
         state = self._program.init(self._keys)
         check_resets(state.env)
-        return state
+        if self._networks is None:
+            return state
+        states = [begin_with(self._algorithm, own, self._networks) for own in self._program.split(state)]
+        return self._program.merge(states)
 
     def _stop_signal(self, interrupt: Interrupt) -> str | None:
         """Name of the stop signal, from whichever process received it."""
@@ -284,17 +294,6 @@ class Trainer:
             recorder.wait()
         for filmer in self._filmers:
             filmer.wait()
-
-    def _divergence(self, state: TrainState, call: int) -> str:
-        """Name the runs that have diverged, each with its first learned leaf that is not finite."""
-        found = []
-        for seed, own in zip(self._seeds, self._program.split(without_replay(state)), strict=True):
-            names = [name for name, leaf in learned_leaves(own).items() if not jnp.isfinite(leaf).all()]
-            found += [f"{name} of seed {seed}" for name in names[:1]]
-        return (
-            f"training has diverged: after {self._env_steps(call):,} steps {', '.join(found)} is not finite; "
-            "earlier checkpoints are kept; start a new run with a lower learning rate, or clip gradients"
-        )
 
     def _seconds(self) -> float:
         return self._seconds_before + time.monotonic() - self._started

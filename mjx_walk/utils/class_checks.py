@@ -9,7 +9,7 @@ from mjx_walk.utils.errors import UserError
 __all__ = ["check_class", "check_decorated", "identity"]
 
 
-def check_class(what: str, name: str, kind: object, base: type, module: str, known: Mapping[str, type]) -> None:
+def check_class(what: str, name: str, kind: object, base: type, advice: str, known: Mapping[str, type]) -> None:
     """Check a class that is to be registered.
 
     Args:
@@ -17,7 +17,7 @@ def check_class(what: str, name: str, kind: object, base: type, module: str, kno
         name: under which it is to be registered.
         kind: the class.
         base: the class from which it must derive.
-        module: from which users import the base class.
+        advice: what to give instead, for the message.
         known: classes that are registered already, by name. One that stays the same may be registered again.
 
     Raises:
@@ -28,7 +28,7 @@ def check_class(what: str, name: str, kind: object, base: type, module: str, kno
         raise UserError(f"{what} cannot be called '{name}'; use lower-case letters, digits and underscores")
     if not (isinstance(kind, type) and issubclass(kind, base)):
         found = f"the {type(kind).__name__} {kind.__name__}" if hasattr(kind, "__name__") else repr(kind)
-        raise UserError(f"the {noun} '{name}' is {found}; give a subclass of {module}.{base.__name__}")
+        raise UserError(f"the {noun} '{name}' is {found}; give {advice}")
     missing = sorted(getattr(kind, "__abstractmethods__", ()))
     if missing:
         raise UserError(f"the class {kind.__name__} of the {noun} '{name}' does not define: {', '.join(missing)}")

@@ -19,6 +19,7 @@ __all__ = [
     "PER_DEVICE",
     "RANDOM_KEY",
     "REPLAY",
+    "RESTARTS",
     "Act",
     "Losses",
     "Metric",
@@ -101,7 +102,9 @@ REPLAY = PER_DEVICE | {"replay": True}
 """Each device holds its own, and only the newest checkpoint keeps it."""
 RANDOM_KEY = PER_DEVICE | {"random_key": True}
 """Each device holds its own; a device that joins a run folds its index into it."""
-ITERATION_COUNT = {"iteration_count": True}
+RESTARTS = {"restarts": True}
+"""A training that begins with another one's networks starts it anew."""
+ITERATION_COUNT = RESTARTS | {"iteration_count": True}
 """A count of iterations, whose environment steps depend on the number of devices."""
 
 

@@ -12,6 +12,7 @@ import imageio.v3 as iio
 import jax
 import numpy as np
 
+from mjx_walk.envs import require_model
 from mjx_walk.evaluation.saved_policies import SavedPolicy
 from mjx_walk.logs.tensorboard import EventFile, Summary
 from mjx_walk.machine.subprocesses import start_module
@@ -70,7 +71,7 @@ class Filmer:
 def film(folder: Path) -> None:
     """Film the policy saved in `films/ENV_STEPS`, and replace the folder with `films/ENV_STEPS.mp4`."""
     run = SavedPolicy(RunFolder(folder), "c", FINAL)
-    episode = record_episode(run.task, run.policy, size=_SIZE, frame_rate=_FRAMES_PER_SECOND)
+    episode = record_episode(require_model(run.task), run.policy, size=_SIZE, frame_rate=_FRAMES_PER_SECOND)
     write_film(episode.frames, folder.with_suffix(".mp4"), episode.frames_per_second)
     num_shown = round(_SECONDS_IN_TENSORBOARD * episode.frames_per_second)
     shown = np.stack(episode.frames[:num_shown:_TENSORBOARD_FRAME_STRIDE])

@@ -8,15 +8,13 @@ import shutil
 from pathlib import Path
 
 from mjx_walk.storage.files import user_path
-from mjx_walk.storage.run_folder import RunFolder, open_existing
+from mjx_walk.storage.run_folder import PREFIX, RunFolder, open_existing
 from mjx_walk.storage.scores import BEST, read_scores
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.near_misses import near_misses
 from mjx_walk.utils.text import format_score
 
 __all__ = ["PREFIX", "empty_folder", "holds", "names", "open_run", "output_path", "table"]
-
-PREFIX = "zoo:"
 
 _FOLDER = Path(__file__).parent
 

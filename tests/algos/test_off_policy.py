@@ -105,3 +105,22 @@ def test_observations_are_clipped_where_the_policy_acts_and_where_it_learns(clip
     assert float(jnp.abs(state.replay.action[:4]).max()) == pytest.approx(0.01 * seen)
     acted = algorithm.policy(algorithm.policy_params(state))(jnp.full((1, 1), 60.0), jax.random.PRNGKey(0))
     assert float(acted[0, 0]) == pytest.approx(0.01 * min(seen, 60.0))
+
+
+class SlowSteps(EndlessReward):
+    dt = 0.016
+
+
+@pytest.mark.parametrize(("task", "noise", "targets"), [(SlowSteps(), 4, 2), (EndlessReward(), 6, 4)])
+def test_noise_and_targets_last_as_long_at_every_control_frequency(task, noise, targets):
+    """64 ms and 40 ms, at 16 and at 10 ms a step. Before learning starts, only the noise's key decides on actions."""
+    algorithm, state, _ = iterate(task, 6, n_step=None, noise_repeat=None, learning_starts=64)
+    actions = np.asarray(state.replay.action)[:12, 0, 0]
+    assert algorithm.n_step == targets
+    np.testing.assert_array_equal(actions, actions[np.arange(12) // noise * noise])
+    assert len(np.unique(actions)) == 12 // noise
+
+
+def test_a_long_step_is_one_step():
+    algorithm, _, _ = iterate(type("Slowest", (EndlessReward,), {"dt": 0.2})(), 1, n_step=None, noise_repeat=None)
+    assert (algorithm.n_step, algorithm.noise_repeat) == (1, 1)

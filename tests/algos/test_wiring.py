@@ -31,6 +31,7 @@ CHANGES = {
     "final_target_entropy": {None: -1.0},
     "policy_delay": {1: 2},
     "learning_starts": {8: 16},
+    "random_steps": {None: 4},
     "replay_capacity": {64: 128},
     "ou_noise_std": {0.0: 0.1},
     "max_tail_discount": {0.95: 0.93},

@@ -42,7 +42,7 @@ def test_filling_the_replay_is_said_and_has_no_time_left(lines):
         shown.update(row(steps, 50.0, **{"train/critic_updates": updates, "eval/return": 1.0}))
     shown.close()
     assert lines()[1:] == [
-        "Filling the replay with random actions, before learning starts",
+        "Filling the replay, before learning starts",
         "1,000 steps  eval 1.00",
         "2,000 steps         50/s  eval 1.00",
         "3,000 steps         50/s  eval 1.00  2 min 20 s left",
