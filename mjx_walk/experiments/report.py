@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 
+from mjx_walk.experiments.budgets import at_budgets
 from mjx_walk.experiments.curves import draw_suite, draw_task
 from mjx_walk.experiments.logged_runs import MIN_SEEDS_FOR_IQM, LoggedRun, group, interval, read_runs
 from mjx_walk.experiments.suite import REFERENCES, normalize
@@ -20,7 +21,9 @@ __all__ = ["write_report"]
 
 _LEGEND = (
     "Scores are mean returns in Gymnasium. The final policy is the newest one. The best policy has the highest "
-    "evaluation during training. In files from older versions, it is the better of the two on the scored episodes.\n"
+    "evaluation during training. In files from older versions, it is the better of the two on the scored episodes. "
+    "The last table interpolates the evaluations during training, and takes the mean over the seeds. Its seconds are "
+    "those of training.\n"
 )
 _NORMALIZED = (
     "A normalized score is 0 for uniformly random actions and 1 for the highest mean that SLM-Lab 5 has published for "
@@ -62,8 +65,13 @@ def write_report(folder: Path) -> Path:
             (groups,) = tasks.values()
             draw_task(groups, folder / "comparison.png")
             tables, notes = [_summaries(groups)], [_LEGEND]
+        budgets = [
+            {**task_cells[task], "variant": name, **at_budgets(same)}
+            for task, groups in tasks.items()
+            for name, same in groups.items()
+        ]
         write_csv(rows, folder / "comparison.csv")
-        write_text(path, "\n".join([*map(_table, [*tables, cells]), *notes]))
+        write_text(path, "\n".join([*map(_table, [*tables, cells, budgets]), *notes]))
     except OSError as error:
         raise UserError(f"cannot write to '{folder}': {error.strerror}") from error
     return path
@@ -88,6 +96,7 @@ def _summary(variant: str, runs: list[LoggedRun], policy: str) -> dict[str, str]
         "policy": policy,
         "score": mean,
         "std over seeds": std,
+        "lowest seed": _lowest(scores),
         "95% interval, low": low,
         "95% interval, high": high,
         "IQM": format_score(scipy.stats.trim_mean(scores, 0.25) if len(scores) >= MIN_SEEDS_FOR_IQM else None),
@@ -106,6 +115,11 @@ def _statistics(scores: np.ndarray) -> list[str]:
     mean = scores.mean() if len(scores) else None
     std = scores.std(ddof=1) if len(scores) > 1 else None
     return [format_score(value) for value in (mean, std, *(interval(scores) or (None, None)))]
+
+
+def _lowest(scores: np.ndarray) -> str:
+    """The cell of the lowest of `[N]` scores; a dash for none."""
+    return format_score(scores.min() if len(scores) else None)
 
 
 def _costs(runs: list[LoggedRun]) -> dict[str, str]:
@@ -191,6 +205,7 @@ def _task_summary(task: str, name: str, runs: list[LoggedRun]) -> dict[str, str]
         "variant": name,
         "final": mean,
         "std over seeds": std,
+        "lowest seed": _lowest(final),
         "95% low": low,
         "95% high": high,
         "best": _statistics(best)[0],

@@ -26,9 +26,9 @@ def test_runs_are_grouped_by_what_sets_them_apart(tmp_path):
         "ppo, discount=0.5": 2,
     }
     text = report.write_report(tmp_path).read_text()
-    assert "| ppo, discount=0.99 | final | 15.0 | 7.07 | – | – | – | 2 | 2 | 3.00 | 30 |" in text
-    assert "| ppo, discount=0.99 | best | 25.0 | 7.07 | – | – | – | 2 | 2 | 3.00 | 30 |" in text
-    assert "| ppo, discount=0.5 | final | – | – | – | – | – | 0 | 2 | 2.00 | 20 |" in text
+    assert "| ppo, discount=0.99 | final | 15.0 | 7.07 | 10.0 | – | – | – | 2 | 2 | 3.00 | 30 |" in text
+    assert "| ppo, discount=0.99 | best | 25.0 | 7.07 | 20.0 | – | – | – | 2 | 2 | 3.00 | 30 |" in text
+    assert "| ppo, discount=0.5 | final | – | – | – | – | – | – | 0 | 2 | 2.00 | 20 |" in text
     assert "| ppo, discount=0.99 | 1 | 20.0 | 1.00 | 30.0 | 2.00 | 3.00 | 30 | 1 |" in text
     rows = list(csv.DictReader((tmp_path / "comparison.csv").open()))
     assert len(rows) == 6 and {row["final_mean"] for row in rows} == {"10.0", "20.0", ""}
@@ -65,10 +65,25 @@ def test_runs_of_several_environments_are_normalized(tmp_path):
     fake_run(tmp_path / "ant" / "3", ["env=ant", "seed=3"], [1, 2], 5000.0)  # not scored in the others
     text = report.write_report(tmp_path).read_text()
     assert "| ppo | final | 2.00 | -0.48 | 4.48 | 2.00 | -0.48 | 4.48 | 4 | 3 |" in text
-    assert "| Reacher-v5 | ppo | 32.8 | 37.9 | -61.2 | 126.9 | 42.8 | -42.9 | -5.03 | 2.00 |" in text
+    assert "| Reacher-v5 | ppo | 32.8 | 37.9 | -5.03 | -61.2 | 126.9 | 42.8 | -42.9 | -5.03 | 2.00 |" in text
     assert "| Ant-v5 | ppo | 3 | 5,000 | 1.00 | 5,010 |" in text
     assert (tmp_path / "comparison.png").read_bytes()[:4] == b"\x89PNG"
     assert len((tmp_path / "comparison.csv").read_text().splitlines()) == 1 + 13
+
+
+def test_the_last_table_has_returns_at_equal_steps_and_seconds(tmp_path):
+    """Evaluations of policies of 0.5M and 5.5M steps."""
+    for seed, last in ((0, 900.0), (1, 1100.0)):
+        fake_run(tmp_path / str(seed), ["env=walker2d", f"seed={seed}"], [1, 2, 3, 4, 5, 6])
+        path = tmp_path / str(seed) / "metrics.jsonl"
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        rows[1] |= {"eval/env_steps": 5e5, "eval/return": 100.0}
+        rows[5] |= {"eval/env_steps": 5.5e6, "eval/return": last}
+        path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    text = report.write_report(tmp_path).read_text()
+    # 1M and 5M steps: 100 + 0.1 · 900 and 100 + 0.9 · 900, of the mean of both seeds. The log begins after 10 s.
+    assert "| variant | 1M steps | 5M steps | 20M steps | 60 s | 120 s | 300 s |" in text
+    assert "| ppo | 190.0 | 910.0 | – | – | – | – |" in text
 
 
 def test_only_gymnasiums_own_environment_has_a_reference(tmp_path):
