@@ -34,7 +34,8 @@ def test_readme_shows_the_best_recipe_of_each_task():
     """The scores of several seeds, or else the highest one of a single seed, which the table says."""
     shown = [row for row in cells("README.md") if row[0] in REFERENCES]
     assert [row[0] for row in shown] == list(REFERENCES)
-    log = [row for row in read("experiments.csv") if re.fullmatch(r"(MS|PT)\d+", row["id"])]
+    log = [row for row in read("experiments.csv") if re.fullmatch(r"(EG|PT)\d+", row["id"])]
+    log = [row for row in log if row["verdict"] == "measured"]
     for task, algorithm, score, _, seeds, *_ in shown:
         of_task = [row for row in read("results.csv") if row["task"] == task]
         one_seed = [row for row in log if row["task"] == task.removesuffix("-v5")]

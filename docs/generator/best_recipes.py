@@ -8,10 +8,10 @@ from generator.score_tables import highest_published, number, read
 from mjx_walk.experiments.suite import REFERENCES
 
 _ONE_SEED = {
-    "MS": ("csac", "at most 5 other runs"),
+    "EG": ("csac", "at most 8 other runs"),
     "PT": ("PPO", "1 other run"),
 }
-"""Arms of one seed on every task, by the letters of their ids: the algorithm, and other trainings on the GPU."""
+"""Arms of the recipes with one seed, by the letters of their ids: the algorithm, and other trainings on the GPU."""
 _DASH = "–"
 
 
@@ -44,7 +44,7 @@ def best_recipes() -> list[Best]:
             several.setdefault(row["task"], []).append(_of_several_seeds(row))
     one: dict[str, list[Best]] = {}
     for row in read("experiments.csv"):
-        if re.fullmatch(rf"({'|'.join(_ONE_SEED)})\d+", row["id"]):
+        if re.fullmatch(rf"({'|'.join(_ONE_SEED)})\d+", row["id"]) and row["verdict"] == "measured":
             one.setdefault(f"{row['task']}-{row['version']}", []).append(_of_one_seed(row))
     found = [several.get(task) or one[task] for task in REFERENCES]
     return [max(rows, key=lambda row: (float(row.score), -float(row.seconds))) for rows in found]
@@ -80,7 +80,7 @@ def _of_one_seed(row: dict[str, str]) -> Best:
         million_steps=f"{int(row['steps']) / 1e6:.1f}",
         seconds=row["seconds"],
         shared_with=shared_with,
-        command=f"env={name} algo={algorithm.lower()}",
+        command=f"env={name} algo={algorithm.lower()}" + ("" if row["seeds"] == "0" else f" seed={row['seeds']}"),
     )
 
 
