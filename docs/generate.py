@@ -30,6 +30,7 @@ def pages() -> dict[Path, str]:
     found[DOCS / "tasks" / "index.md"] = _filled("tasks/index.md", index)
     groups = {name: setting_tables.group_table(name) for name in setting_tables.GROUPS}
     found[DOCS.parent / "README.md"] = _filled("../README.md", {"best": best_recipes.summary()})
+    found[DOCS / "claims.md"] = _filled("claims.md", {"claims": score_tables.claims()})
     for page, blocks in _figures().items():
         found[DOCS / page] = _filled(page, blocks)
     found[DOCS / "training.md"] = _filled("training.md", {"scaling-summary": scaling.summary()})

@@ -179,3 +179,27 @@ def test_numbers_in_prose_are_in_a_table(page):
         if is_a_figure and value not in (roughly if about else known):
             unknown.append(number)
     assert unknown == []
+
+
+def test_every_number_of_readme_has_a_source():
+    """Each claim stands in README, names arms of the log, and every sentence with a number has a claim."""
+    text = (CLONE / "README.md").read_text()
+    claims = read("claims.csv")
+    assert [row["claim"] for row in claims if row["claim"] not in " ".join(text.split())] == []
+    log = {row["id"] for row in read("experiments.csv")}
+    assert {arm for row in claims for arm in re.findall(r"\b(?:[HS]\d+|[A-Z]{2}\d+)\b", row["source"])} <= log
+    unsourced = [line for line in sentences_with_numbers(text) if not any(row["claim"] in line for row in claims)]
+    assert unsourced == []
+    rows = [line for line in text.splitlines() if re.match(r"\| \w+-v5 \|", line)]
+    assert [line for line in rows if sum(line.startswith(row["claim"]) for row in claims) != 1] == []
+
+
+def sentences_with_numbers(text):
+    """Sentences of README before its comparison of projects, without tables, programs and targets of links."""
+    prose = re.sub(r"```.*?```", "", text.partition("## Comparison")[0], flags=re.DOTALL)
+    prose = re.sub(r"^\||^- ", "\n", re.sub(r"^\|.*\|$", "", prose, flags=re.MULTILINE), flags=re.MULTILINE)
+    for paragraph in prose.split("\n\n"):
+        for sentence in re.split(r"(?<=[.:!?])\s+(?=[A-Z`*\[])", " ".join(paragraph.split())):
+            bare = re.sub(r"`[^`]*`|\]\([^)]*\)|\b[A-Za-z]\w*\d\w*|A2C", "", sentence)
+            if re.search(r"\d", bare):
+                yield sentence

@@ -43,6 +43,13 @@ def published(several_seeds: bool) -> str:
     return table(titles, rows)
 
 
+def claims() -> str:
+    """The numbers of README, with their sources."""
+    titles = ("Claim of README", "Source", "Command", "What to know")
+    rows = [(row["claim"].strip("| ").replace(" | ", ", "), *list(row.values())[1:]) for row in read("claims.csv")]
+    return table(titles, rows)
+
+
 def recipes() -> str:
     """Every recipe for a GPU that has been scored."""
     titles = ("Task", "Algorithm", "Policy", ">Score", ">Std", ">Lowest seed", ">Seeds", ">Steps (M)")
