@@ -195,7 +195,7 @@ def leaves(run_dir, call):
 def saved_leaves(path):
     """All leaves of a checkpoint, read without the package."""
     found = {}
-    for part in (path / "arrays", path / "replay"):
+    for part in (path / "arrays", path / "replay", path / "snapshots"):
         if (part / "arrays.npz").exists():
             with np.load(part / "arrays.npz") as arrays:
                 found |= dict(arrays)

@@ -16,7 +16,7 @@ from mjx_walk.logs.metrics import read_rows
 from mjx_walk.settings.saved_config import MAY_DIFFER, differences
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.run_folder import RunFolder
-from mjx_walk.storage.scores import POLICIES, read_scores
+from mjx_walk.storage.scores import read_scores
 from mjx_walk.training.checks import prepared
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.recorder import Recorder
@@ -40,7 +40,9 @@ class Examiner:
         for path in checkpoint.list_steps(run_dir / "checkpoints"):
             self.states[int(path.name)] = jax.device_get(checkpoint.restore(path, self.like)[0])
         self.rows = read_rows(run_dir / "metrics.jsonl")
-        self.policies = {name: saved_policies._load(RunFolder(run_dir), name, self.algorithm) for name in POLICIES}
+        folder = RunFolder(run_dir)
+        names = saved_policies.kept_policies(folder)
+        self.policies = {name: saved_policies._load(folder, name, self.algorithm) for name in names}
         self.scores = read_scores(run_dir / "eval_gymnasium.json")
 
     def resolve(self, run_dir):

@@ -1,4 +1,4 @@
-"""The final and the best policy of a run, saved separately from its checkpoints and small enough to ship."""
+"""The policies that a run keeps by name, saved separately from its checkpoints and small enough to ship."""
 
 import dataclasses
 import functools
@@ -23,7 +23,7 @@ from mjx_walk.settings.saved_config import read_saved_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.storage.run_folder import RunFolder
-from mjx_walk.storage.scores import BEST, FINAL, POLICIES
+from mjx_walk.storage.scores import BEST, FINAL, MILESTONES, POLICIES
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import Act, PolicyFn, PolicyParams
 
@@ -54,6 +54,7 @@ class SavedPolicy:
             physics: engine to use instead of the run's own.
             policy: `final`, the one of the newest checkpoint, or `best`, the one with the highest evaluation during
                 training or at its end. Before the first evaluation ends, there is only `final`, and `best` gives it.
+                `medium` and `simple` exist after a training with `checkpoint.milestones`.
 
         Raises:
             UserError: no usable policy.
@@ -69,7 +70,7 @@ class SavedPolicy:
         self._build()
         warn_of_changed_inputs(folder, saved.env)
         self.policy_name = choose_policy(folder, policy)
-        """`final` or `best`."""
+        """`final`, `best`, `medium` or `simple`."""
         self.policy_params, self.policy_metadata = _load(folder, self.policy_name, self.algorithm)
 
     def _build(self) -> None:
@@ -170,6 +171,10 @@ def choose_policy(folder: RunFolder, name: str) -> str:
     kept = kept_policies(folder)
     if name in kept:
         return name
+    if name in MILESTONES:
+        raise UserError(
+            f"{folder.path} has no {name} policy; a complete training with checkpoint.milestones=true keeps one"
+        )
     if name == FINAL and kept and not checkpoint.list_steps(folder.checkpoints):
         raise UserError(f"{folder.path} has kept only its best policy; choose policy=best")
     if FINAL in kept:
@@ -191,11 +196,13 @@ def kept_policies(folder: RunFolder) -> list[str]:
 
 
 def _load(folder: RunFolder, name: str, algorithm: Algorithm) -> tuple[PolicyParams, Metadata]:
-    """A policy that a run has kept; if it is damaged, the one in the newest checkpoint that is complete."""
+    """A policy that a run has kept. If the final or the best one is damaged, the newest complete checkpoint has it."""
     state = algorithm.state_shapes()
     try:
         return load_policy(folder, name, jax.eval_shape(algorithm.policy_params, state))
     except UserError as error:
+        if name in MILESTONES:
+            raise
         try:
             state, metadata = checkpoint.restore_newest(folder.checkpoints, without_replay(state))
         except UserError:
@@ -208,6 +215,8 @@ def _load(folder: RunFolder, name: str, algorithm: Algorithm) -> tuple[PolicyPar
 
 def load_policy(folder: RunFolder, name: str, like: PolicyParams) -> tuple[PolicyParams, Metadata]:
     """A policy that a run has kept, its `env_steps`, and `eval_return` if an evaluation during training chose it.
+
+    The metadata of a milestone also have its `fraction`.
 
     Raises:
         UserError: the policy is missing or damaged, or it belongs to another environment.
@@ -224,6 +233,8 @@ def load_policy(folder: RunFolder, name: str, like: PolicyParams) -> tuple[Polic
     metadata: Metadata = {"env_steps": meta["env_steps"]}
     if "eval_return" in meta:
         metadata["eval_return"] = meta["eval_return"]
+    if "fraction" in meta:
+        metadata["fraction"] = meta["fraction"]
     return params, metadata
 
 

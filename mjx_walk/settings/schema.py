@@ -23,6 +23,9 @@ class CheckpointConfig:
     max_to_keep: int = setting(3, at_least=1)
     """Number of newest checkpoints to keep. Several seeds or devices keep one more until training ends. The best policy
     is kept separately."""
+    milestones: bool = False
+    """Also keep the policies `simple` and `medium`, about one and two thirds of the way from the return of the first
+    policy to that of the best one. They are chosen at the end. Each checkpoint then holds up to 32 policies."""
 
 
 @dataclasses.dataclass

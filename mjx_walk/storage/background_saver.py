@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mjx_walk.storage import checkpoint
+from mjx_walk.storage.arrays import HostArrays
 from mjx_walk.storage.checkpoint_metadata import Metadata
 
 __all__ = ["BackgroundSaver", "Part"]
@@ -18,6 +19,8 @@ class Part(NamedTuple):
     tree: object
     """Pytree of arrays."""
     metadata: Metadata
+    further: HostArrays = {}
+    """Further arrays by name, on the host."""
 
 
 class BackgroundSaver:
@@ -42,7 +45,7 @@ class BackgroundSaver:
     def save(self, *parts: Part) -> None:
         """Copy pytrees to the host and start to write them in order. Waits for the previous save first."""
         self.wait()
-        copied = [part._replace(tree=checkpoint.to_host(part.tree)) for part in parts]
+        copied = [part._replace(tree=checkpoint.to_host(part.tree) | part.further) for part in parts]
         self._running = self._executor.submit(self._save, copied)
 
     def wait(self) -> None:
@@ -67,7 +70,7 @@ class BackgroundSaver:
             checkpoint.discard_from(self._folder, steps[0])
             self.prune()
         for part in parts:
-            checkpoint.save(*part, config=self._config)
+            checkpoint.save(part.path, part.tree, part.metadata, config=self._config)
         if not self._prune_first:
             if steps:
                 checkpoint.discard_from(self._folder, steps[0] + 1)

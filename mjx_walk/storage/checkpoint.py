@@ -24,6 +24,7 @@ from mjx_walk.utils.errors import UnreadableError, UserError, failed_read
 from mjx_walk.utils.versions import __version__
 
 __all__ = [
+    "SNAPSHOTS",
     "config_copy",
     "discard_from",
     "find",
@@ -48,6 +49,8 @@ _CONFIG = "run_config.yaml"
 _CONFIG_CHECKSUM: Final = "config_crc32"
 _REPLAY = "replay"
 """Field of the TrainState that only the newest checkpoint keeps, and the name of its folder."""
+SNAPSHOTS = "snapshots"
+"""Start of the names of policies that a checkpoint holds besides the TrainState, and the name of their folder."""
 
 _RENAMED_LEAVES = {
     "updates": "iterations",
@@ -80,12 +83,10 @@ def save(path: Path, tree: object, meta: Metadata, as_numpy: bool = False, confi
     """
     arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
     meta = meta | {"crc32": {name: crc32(x) for name, x in arrays.items()}}
-    replay = {name: x for name, x in arrays.items() if _is_replay(name)}
     with replacing_folder(path) as unfinished:
-        rest = {name: x for name, x in arrays.items() if name not in replay}
-        write_arrays(unfinished / _ARRAYS, rest, as_numpy)
-        if replay:
-            write_arrays(unfinished / _REPLAY, replay, as_numpy)
+        for folder in (_ARRAYS, *sorted({_folder_of(name) for name in arrays} - {_ARRAYS})):
+            own = {name: x for name, x in arrays.items() if _folder_of(name) == folder}
+            write_arrays(unfinished / folder, own, as_numpy)
         if config is not None:
             write_text(unfinished / _CONFIG, config)
             meta[_CONFIG_CHECKSUM] = crc32(config.encode())
@@ -142,7 +143,9 @@ def restore(path: Path, like: _Tree) -> tuple[_Tree, Metadata]:
     config_copy(path)
     wanted = _named_leaves(like)
     meta["crc32"] = {present_name(name): crc for name, crc in meta["crc32"].items()}
-    arrays = read_arrays(path / _ARRAYS, wanted, present_name)
+    arrays: HostArrays = {}
+    for folder in sorted({_folder_of(name) for name in wanted} - {_REPLAY}):
+        arrays |= read_arrays(path / folder, wanted, present_name)
     if any(_is_replay(name) for name in meta["crc32"]) and any(map(_is_replay, wanted)):
         if (path / _REPLAY).exists():
             arrays |= read_arrays(path / _REPLAY, wanted, present_name)
@@ -266,7 +269,13 @@ def prune(folder: Path, max_to_keep: int) -> None:
 
 
 def _is_replay(name: str) -> bool:
-    return name.startswith(f"{_REPLAY}.")
+    return _folder_of(name) == _REPLAY
+
+
+def _folder_of(leaf: str) -> str:
+    """Name of the folder, in that of the checkpoint, that holds a leaf."""
+    first = leaf.partition(".")[0]
+    return first if first in (_REPLAY, SNAPSHOTS) else _ARRAYS
 
 
 def _named_leaves(tree: object) -> dict[str, jax.Array]:

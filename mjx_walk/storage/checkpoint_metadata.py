@@ -17,6 +17,7 @@ FORMAT = 1
 
 _MAX_BYTES = 2_000_000
 _MAX_NUMBER = 1e300
+_MAX_SNAPSHOTS = 100
 _REQUIRED = ("env_steps", "crc32")
 
 
@@ -37,6 +38,10 @@ class Metadata(TypedDict, total=False):
     """Runs that trained in one program."""
     eval_return: float
     """Mean return of the evaluation that chose the policy."""
+    fraction: float
+    """Of a milestone: the part of the way from the first evaluation to the best one at which it is."""
+    snapshots: list[int]
+    """Environment steps of the snapshots of policies that a checkpoint holds."""
     log_rows: int
     """Rows of `metrics.jsonl` so far."""
     log_crc32: int
@@ -87,11 +92,17 @@ def _is_finite(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < _MAX_NUMBER
 
 
+def _are_few_counts(value: Any) -> bool:
+    return isinstance(value, list) and len(value) <= _MAX_SNAPSHOTS and all(map(_is_count, value))
+
+
 _FACTS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "env_steps": (_is_count, "a whole number from 0"),
     "wall_seconds": (lambda value: _is_finite(value) and value >= 0, "a number from 0"),
     "num_devices": (lambda value: _is_count(value, 1) and value <= 10**6, "a whole number from 1 to 1,000,000"),
     "eval_return": (_is_finite, "a finite number"),
+    "fraction": (_is_finite, "a finite number"),
+    "snapshots": (_are_few_counts, "a short list of whole numbers from 0"),
     "seeds_together": (lambda value: _is_count(value, 1), "a whole number from 1"),
     "log_rows": (_is_count, "a whole number from 0"),
     "log_crc32": (_is_count, "a whole number from 0"),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mjx_walk.storage.checkpoint import config_copy, find, list_steps
 from mjx_walk.storage.files import user_path
-from mjx_walk.storage.scores import BEST, FINAL
+from mjx_walk.storage.scores import POLICIES
 from mjx_walk.utils.errors import UserError
 
 __all__ = ["PREFIX", "RunFolder", "new_folder", "open_existing"]
@@ -47,7 +47,7 @@ class RunFolder:
         return self.path / "profile"
 
     def policy(self, name: str) -> Path:
-        """Folder of a kept policy, `final` or `best`."""
+        """Folder of a kept policy, one of `POLICIES`."""
         return self.checkpoints / name
 
     @property
@@ -78,7 +78,7 @@ class RunFolder:
     def _saved(self) -> Iterator[Path]:
         """Checkpoints from the newest to the oldest, then the kept policies."""
         yield from reversed(list_steps(self.checkpoints))
-        for name in (FINAL, BEST):
+        for name in POLICIES:
             path = find(self.policy(name))
             if path:
                 yield path
@@ -122,7 +122,7 @@ def open_existing(path: str | Path | None) -> RunFolder:
     for path in (folder.config, folder.inputs, folder.metrics, folder.gymnasium_scores):
         if path.is_dir():
             raise UserError(f"'{path}' is a folder, where a run has a file; remove it")
-    for path in (folder.checkpoints, folder.policy(FINAL), folder.policy(BEST)):
+    for path in (folder.checkpoints, *map(folder.policy, POLICIES)):
         if path.is_file():
             raise UserError(f"'{path}' is a file, where a run has a folder; remove it")
     return folder

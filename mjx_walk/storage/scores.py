@@ -13,13 +13,27 @@ from mjx_walk.storage.checksums import read_json, take_checksum, with_checksum
 from mjx_walk.storage.files import write_text
 from mjx_walk.utils.versions import package_versions
 
-__all__ = ["BEST", "BETTER", "FINAL", "POLICIES", "ScoreBlock", "ScoreFile", "Scores", "read_scores", "write_scores"]
+__all__ = [
+    "BEST",
+    "BETTER",
+    "FINAL",
+    "MILESTONES",
+    "POLICIES",
+    "ScoreBlock",
+    "ScoreFile",
+    "Scores",
+    "read_scores",
+    "write_scores",
+]
 
 FINAL = "final"
 """The policy of the newest checkpoint, at the end of the training so far."""
 BEST = "best"
 """The policy with the highest evaluation during training or at its end."""
-POLICIES = (FINAL, BEST)
+MILESTONES = {"medium": 2 / 3, "simple": 1 / 3}
+"""Policies that a run keeps on request: the fraction of the way from the first evaluation to the best one, by name."""
+POLICIES = (FINAL, BEST, *MILESTONES)
+"""Names of the policies that a run may keep."""
 BETTER = "better"
 """The better of both, chosen on the scored episodes themselves: what a file with one block holds."""
 

@@ -1,8 +1,11 @@
 """Write the metrics, checkpoints and policies of a run to its folder."""
 
 import contextlib
+import logging
 import shlex
 from collections.abc import Iterator
+
+import jax
 
 from mjx_walk.algos import Algorithm, TrainState
 from mjx_walk.evaluation.saved_policies import best_policy
@@ -12,16 +15,21 @@ from mjx_walk.settings.config import Config
 from mjx_walk.settings.input_files import read_inputs, save_inputs
 from mjx_walk.settings.saved_config import as_yaml, save_config
 from mjx_walk.storage import checkpoint
+from mjx_walk.storage.arrays import HostArrays
 from mjx_walk.storage.background_saver import BackgroundSaver, Part
 from mjx_walk.storage.checkpoint_metadata import Metadata
+from mjx_walk.storage.folders import discard
 from mjx_walk.storage.run_folder import RunFolder
-from mjx_walk.storage.scores import BEST, FINAL
+from mjx_walk.storage.scores import BEST, FINAL, MILESTONES
 from mjx_walk.training.distributed import Processes
+from mjx_walk.training.milestones import KeptPolicies, Snapshots, milestone_line
 from mjx_walk.training.restoring import NUM_DEVICES, SEEDS_TOGETHER, device_folder
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import PolicyParams
 
 __all__ = ["Recorder", "reporting_failed_writes"]
+
+_LOGGER = logging.getLogger(__name__)
 
 
 class Recorder:
@@ -55,15 +63,17 @@ class Recorder:
             self._checkpoints, config.checkpoint.max_to_keep, as_yaml(config), prune_first=is_saved_with_others
         )
         self._saved_best_iteration = -1
+        self.snapshots = Snapshots() if config.checkpoint.milestones and processes.is_main_process else None
+        """Policies from which milestones are chosen; None if the run keeps none."""
         self._writer: MetricsWriter | None = None
         self._wandb: WandbLog | None = None
 
     def begin(self, env_steps: int, will_train: bool, restored: Metadata) -> None:
-        """Open the logs. Save the configuration of a resumed run.
+        """Open the logs. Save the configuration of a resumed run, and read its snapshots of policies.
 
         Args:
             env_steps: environment steps at which the run resumes; later rows are dropped.
-            will_train: whether iterations follow; they invalidate an old score, which is then removed.
+            will_train: whether iterations follow; they invalidate an old score and old milestones, which are removed.
             restored: metadata of the checkpoint from which the run resumes; empty for a new run.
         """
         if not self._processes.is_main_process:
@@ -77,6 +87,13 @@ class Recorder:
             self._wandb = WandbLog(self._config, self._folder) if self._config.wandb_project else None
             if will_train:
                 self._folder.gymnasium_scores.unlink(missing_ok=True)
+            for name in MILESTONES if will_train and self.snapshots else ():
+                with contextlib.suppress(FileNotFoundError):
+                    discard(self._folder.policy(name))
+        if self.snapshots and restored:
+            path = checkpoint.step_path(self._checkpoints, restored["env_steps"])
+            like = jax.eval_shape(self._algorithm.policy_params, self._algorithm.state_shapes())
+            self.snapshots = Snapshots.restore(path, restored, like)
 
     def write(self, row: Row) -> None:
         """Log a row."""
@@ -85,6 +102,11 @@ class Recorder:
                 self._writer.write(row)
         if self._wandb:
             self._wandb.write(row)
+
+    def take_snapshot(self, policy_params: PolicyParams, env_steps: int) -> None:
+        """Keep the present policy as a snapshot, if the run keeps milestones."""
+        if self.snapshots:
+            self.snapshots.take(policy_params, env_steps)
 
     def save(self, state: TrainState, env_steps: int, wall_seconds: float) -> None:
         """Start saving the best policy if it is new, then the final policy, then the complete state.
@@ -99,7 +121,10 @@ class Recorder:
         }
         if self._writer:
             metadata |= self._writer.position
-        parts = [Part(checkpoint.step_path(self._checkpoints, env_steps), state, metadata)]
+        further: HostArrays = {}
+        if self.snapshots:
+            further, metadata["snapshots"] = self.snapshots.arrays(), self.snapshots.env_steps.copy()
+        parts = [Part(checkpoint.step_path(self._checkpoints, env_steps), state, metadata, further)]
         if self._processes.is_main_process:
             final = self._algorithm.policy_params(state)
             parts.insert(0, Part(self._folder.policy(FINAL), final, {"env_steps": env_steps}))
@@ -112,10 +137,21 @@ class Recorder:
                 self._writer.sync()
             self._saver.save(*parts)
 
-    def save_best(self, policy_params: PolicyParams, metadata: Metadata) -> None:
-        """Start saving a policy as the best one."""
-        with reporting_failed_writes(self._folder):
-            self._saver.save(Part(self._folder.policy(BEST), policy_params, metadata))
+    def save_policies(self, policies: KeptPolicies) -> None:
+        """At the end of a training, start saving the milestones, and the final policy as the best one if it is that.
+
+        Args:
+            policies: the `final` and the `best` policy and the milestones, by name.
+        """
+        names = [name for name in MILESTONES if name in policies]
+        if policies[BEST] is policies[FINAL]:
+            names.append(BEST)
+        if names:
+            with reporting_failed_writes(self._folder):
+                self._saver.save(*(Part(self._folder.policy(name), *policies[name]) for name in names))
+        if self.snapshots:
+            whose = f"Seed {self._config.seed}: " if self._seeds_together > 1 else ""
+            _LOGGER.info(whose + milestone_line(policies))
 
     def wait(self) -> None:
         """Wait until the current save is on disk. Until every run has saved, the others may need the one before it."""

@@ -11,23 +11,22 @@ import jax
 from mjx_walk.algos import Algorithm, TrainState, without_replay
 from mjx_walk.envs.physics import nothing_runs
 from mjx_walk.envs.vector_env import check_resets
-from mjx_walk.evaluation.saved_policies import in_float32
 from mjx_walk.logs.metrics import Row, mean_row, name_metrics, physics_warnings
 from mjx_walk.logs.progress import Progress, Speed
 from mjx_walk.machine.signals import Interrupt, postponed
 from mjx_walk.settings.config import Config
 from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.storage.run_folder import RunFolder
-from mjx_walk.storage.scores import BEST, FINAL
 from mjx_walk.training.call_profile import CallProfile
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.goal import Goal
 from mjx_walk.training.init_from import Networks, begin_with
-from mjx_walk.training.messages import divergence, end_lines, score_lines
+from mjx_walk.training.messages import divergence, end_lines
+from mjx_walk.training.milestones import KeptPolicies
 from mjx_walk.training.programs import compile_together, make_program
 from mjx_walk.training.recorder import Recorder
 from mjx_walk.training.restoring import restore_runs
-from mjx_walk.training.scoring import Policies, final_and_best, score_run
+from mjx_walk.training.scoring import closing_policies, score_runs
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.types import Metrics
 from mjx_walk.viewing.film import Filmer
@@ -78,7 +77,7 @@ class Trainer:
         self._on_metrics = on_metrics or (lambda row: None)
         self._networks = networks
         self._goal = Goal(config.stop_at_return, len(configs))
-        self._policies: list[Policies] = []
+        self._policies: list[KeptPolicies] = []
         """Policies of each run after a complete training, in the main process."""
         self._started = time.monotonic()
         self._seconds_before = 0.0
@@ -103,6 +102,7 @@ class Trainer:
         speed = Speed(call)
         for recorder, saved in zip(self._recorders, metadata, strict=True):
             recorder.begin(self._env_steps(call), call < self._num_calls, saved)
+        self._take_snapshots(state, call)
         saved_call, is_finite = call if restored is not None else None, True
         with Interrupt() as interrupt, profile:
             signal_name = self._stop_signal(interrupt)
@@ -113,6 +113,7 @@ class Trainer:
                 rows = self._rows(call, metrics, speed)
                 self._log(rows)
                 self._goal.take(rows, is_main)
+                self._take_snapshots(state, call)
                 self._film(state, rows)
                 progress.update(mean_row(rows))
                 is_finite = bool(self._program.is_finite(state).all())
@@ -143,7 +144,8 @@ class Trainer:
             _LOGGER.info(f"Scoring {num_episodes} episode{'s' * (num_episodes > 1)} of each policy in {where}")
         try:
             if num_episodes and self._policies:
-                self._score_runs(num_episodes, seconds)
+                runs, total_steps = (self._policies, self._folders, self._seeds), self._env_steps(self._num_calls)
+                score_runs(self._algorithm, *runs, num_episodes, seconds, total_steps)
         finally:
             self._wait_for_files()
         lines = end_lines(self._folders, seconds, self._seconds(), bool(num_episodes), bool(task.model_file))
@@ -226,6 +228,13 @@ class Trainer:
                     _LOGGER.warning(f"{warning}; the metric {metric} has the count")
             self._on_metrics(row)
 
+    def _take_snapshots(self, state: TrainState, call: int) -> None:
+        """Keep the present policies, from which milestones are chosen, if the configuration asks for it."""
+        if self._config.checkpoint.milestones and self._processes.is_main_process:
+            policies = self._program.split(self._algorithm.policy_params(state))
+            for recorder, policy in zip(self._recorders, policies, strict=True):
+                recorder.take_snapshot(policy, self._env_steps(call))
+
     def _film(self, state: TrainState, rows: list[Row]) -> None:
         """Film the policies of the runs whose inline evaluation has ended, if the configuration asks for it."""
         if not self._filmers or not any("eval/return" in row for row in rows):
@@ -263,12 +272,11 @@ class Trainer:
             recorder.prune()
 
     def _choose_policies(self, state: TrainState, call: int) -> None:
-        """Keep the final and the best policy of each run for `score`. Save the final one if it is the best."""
-        states, env_steps = self._program.split(without_replay(state)), self._env_steps(call)
-        self._policies = final_and_best(self._algorithm, states, self._seeds, env_steps, self._steps_per_iteration)
+        """Keep the policies of each run for `score`. Save the milestones, and the final one if it is the best."""
+        runs = (self._program.split(without_replay(state)), [own.snapshots for own in self._recorders], self._seeds)
+        self._policies = closing_policies(self._algorithm, *runs, self._env_steps(call), self._steps_per_iteration)
         for recorder, policies in zip(self._recorders, self._policies, strict=True):
-            if policies[BEST] is policies[FINAL]:
-                recorder.save_best(*policies[BEST])
+            recorder.save_policies(policies)
 
     def _draw_curves(self) -> None:
         from mjx_walk.viewing.run_plots import plot_run  # imports Matplotlib, which slows the start
@@ -278,15 +286,6 @@ class Trainer:
                 plot_run(folder)
             except (OSError, UserError) as error:
                 _LOGGER.warning(f"cannot draw the curves of {folder.path}: {error}; draw them with mjx_walk.plots")
-
-    def _score_runs(self, num_episodes: int, training_seconds: float) -> None:
-        """Score the policies of each run, and log their scores."""
-        acting = in_float32(self._algorithm)
-        total_steps = self._env_steps(self._num_calls)
-        for seed, folder, policies in zip(self._seeds, self._folders, self._policies, strict=True):
-            scored = score_run(acting, policies, folder, num_episodes, training_seconds)
-            for line in score_lines(scored, total_steps, seed if len(self._seeds) > 1 else None):
-                _LOGGER.info(line)
 
     def _wait_for_files(self) -> None:
         """Wait until all checkpoints and films are on disk."""

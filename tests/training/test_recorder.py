@@ -75,7 +75,7 @@ def test_the_final_and_the_best_policy_are_kept(run, monkeypatch):
     assert metadata["env_steps"] == 80
 
     written = []
-    monkeypatch.setattr(recorder._saver, "save", lambda *parts: written.append([path.name for path, _, _ in parts]))
+    monkeypatch.setattr(recorder._saver, "save", lambda *parts: written.append([part.path.name for part in parts]))
     recorder.save(state, env_steps=84, wall_seconds=3.0)
     recorder.save(with_best(algorithm, state, 4.0, 6)[0], env_steps=88, wall_seconds=4.0)
     assert written == [["final", "0000000000084"], ["best", "final", "0000000000088"]]
@@ -88,14 +88,14 @@ def test_a_folder_without_a_final_policy_says_so(run):
     folder.policy("best").mkdir()
     with pytest.raises(UserError, match="has kept only its best policy; choose policy=best"):
         choose_policy(folder, "final")
-    with pytest.raises(UserError, match="policy=last: choose one of: final, best"):
+    with pytest.raises(UserError, match="policy=last: choose one of: final, best, medium, simple"):
         choose_policy(folder, "last")
 
 
 def end(algorithm, state, final_return, monkeypatch):
     """The policies of a run whose training ends with a state, and whose last evaluation gives `final_return`."""
     monkeypatch.setattr(scoring, "evaluate", lambda task, num, policy, key: (jnp.full(num, final_return), None))
-    return scoring.final_and_best(algorithm, [state], seeds=[0], env_steps=80, steps_per_iteration=4)[0]
+    return scoring.closing_policies(algorithm, [state], [None], seeds=[0], env_steps=80, steps_per_iteration=4)[0]
 
 
 @pytest.mark.parametrize(("final", "best"), [(5.0, 9.0), (9.0, 5.0)])
@@ -139,7 +139,7 @@ def test_a_final_policy_with_the_highest_evaluation_is_also_the_best(run, monkey
     monkeypatch.setattr(scoring, "score_in_gymnasium", score)
     policies = end(algorithm, state, 10.5, monkeypatch)
     recorder.save(state, env_steps=80, wall_seconds=1.0)
-    recorder.save_best(*policies["best"])
+    recorder.save_policies(policies)
     scoring.score_run(algorithm, policies, folder, num_episodes=1, training_seconds=1.0)
     recorder.wait()
     params, metadata = kept(folder, "best", algorithm, state)
