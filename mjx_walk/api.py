@@ -103,7 +103,8 @@ def load_run(
         path: its folder, or `zoo:NAME`.
         physics: engine to use instead of the run's own.
         policy: `best`, the policy with the highest evaluation during training or at its end, or `final`, the newest
-            one. `eval` takes `final` by default; `play` and `export` take `best`, as here.
+            one. `eval` takes `final` by default; `play` and `export` take `best`, as here. A training with
+            `checkpoint.milestones` also keeps `medium` and `simple`.
         task: the run's task, if it is your own or of another library, and neither registered nor in a file that you
             trust.
 

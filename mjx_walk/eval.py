@@ -19,12 +19,14 @@ from mjx_walk.utils.setting_fields import MAX_SEED, setting
 __all__ = ["USAGE", "Arguments", "main"]
 
 USAGE = """
-usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [policy=final|best] [episodes=100] [backend=gymnasium|sim] [seed=0]
+usage: python -m mjx_walk.eval run=RUN_DIR|zoo:NAME [policy=NAME] [episodes=100] [backend=gymnasium|sim] [seed=0]
                                [physics=ENGINE]
-       python -m mjx_walk.eval run=RUN_DIR|zoo:NAME robustness=true [policy=final|best] [episodes=20] [seed=0]
+       python -m mjx_walk.eval run=RUN_DIR|zoo:NAME robustness=true [policy=NAME] [episodes=20] [seed=0]
 
   policy=final        the newest policy; the default, except for runs that keep only the best one, such as the zoo's
   policy=best         the policy with the highest evaluation during training, which play and export take by default
+  policy=medium       about two thirds of the way from the first evaluation to the best one; policy=simple is at one
+                      third. A training with checkpoint.milestones=true keeps them.
   backend=gymnasium   the real environment, on the CPU; writes eval_gymnasium.json into the run folder
   backend=sim         the run's own engine, or the one given by physics=
   seed=N              episode i is reset with N + i, so seeds that differ by fewer than `episodes` share episodes; with

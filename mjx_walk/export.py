@@ -13,13 +13,14 @@ from mjx_walk.api import Run, load_run
 from mjx_walk.cli import parsing
 from mjx_walk.envs import require_model
 from mjx_walk.envs.motors import joint_of
-from mjx_walk.evaluation.saved_policies import kept_policies
+from mjx_walk.evaluation.saved_policies import choose_policy, kept_policies
 from mjx_walk.interop import hub_folder
 from mjx_walk.settings.own_tasks import take_task
+from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.storage.files import replacing, user_path
 from mjx_walk.storage.folders import replacing_folder
 from mjx_walk.storage.run_folder import RunFolder
-from mjx_walk.storage.scores import BEST, POLICIES
+from mjx_walk.storage.scores import BEST, MILESTONES, POLICIES
 from mjx_walk.training.messages import choice_line
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import MAX_SEED, refuse_ineffective, setting
@@ -29,15 +30,17 @@ from mjx_walk.viewing.rendering import choose_opengl, write_film
 __all__ = ["USAGE", "Arguments", "main"]
 
 USAGE = """
-usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] [format=onnx] [dtype=float64|float32]
+usage: python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=NAME] [format=onnx] [dtype=float64|float32]
                                  [out=FILE.onnx]
-       python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=minari [episodes=1000]
-                                 [backend=gymnasium|sim] [seed=0] [out=FOLDER]
-       python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=torch [out=FOLDER]
-       python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=best|final] format=hub [out=FOLDER]
+       python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=NAME | policies=NAME,NAME,…] format=minari
+                                 [episodes=1000] [backend=gymnasium|sim] [seed=0] [out=FOLDER]
+       python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=NAME] format=torch [out=FOLDER]
+       python -m mjx_walk.export run=RUN_DIR|zoo:NAME [policy=NAME] format=hub [out=FOLDER]
 
   policy=best     the policy with the highest evaluation during training, the default
   policy=final    the newest policy, which eval scores by default
+  policy=medium   about two thirds of the way from the first evaluation to the best one; policy=simple is at one third.
+                  A training with checkpoint.milestones=true keeps them.
   env.task=FILE.py:CLASS   the task of the run, if it is your own and you have not named its file before
 
 format=onnx, the policy:
@@ -47,6 +50,7 @@ format=onnx, the policy:
   dtype=float64   of `observation`: Gymnasium's observations are float64
 
 format=minari, a dataset of the policy's episodes, without noise:
+  policies=expert,medium,simple   a dataset for each of these policies; expert is the best one
   episodes=1000   complete episodes; those of Humanoid take about 3 MB each
   backend=gymnasium   the real environment, on the CPU
   backend=sim     the run's own engine, on the GPU if there is one; for every task, also your own
@@ -70,6 +74,7 @@ class Arguments:
     run: str | None = None
     policy: str | None = setting(None, choices=POLICIES)
     format: str = setting("onnx", choices=("onnx", "minari", "torch", "hub"))
+    policies: str | None = setting(None, only_if={"format": "minari"})
     dtype: str = setting("float64", choices=("float64", "float32"), only_if={"format": "onnx"})
     episodes: int = setting(1000, at_least=1, only_if={"format": "minari"})
     backend: str = setting("gymnasium", choices=("gymnasium", "sim"), only_if={"format": "minari"})
@@ -86,7 +91,7 @@ def main(command_line: list[str]) -> None:
         parsing.stay_on_cpu()
     folder = zoo.open_run(arguments.run)
     run = _EXPORTS[arguments.format](arguments, folder)
-    if arguments.policy is None and len(kept_policies(folder)) > 1:
+    if arguments.policy is arguments.policies is None and len(kept_policies(folder)) > 1:
         print(choice_line(run.policy_name))
 
 
@@ -131,19 +136,54 @@ def _export_minari(arguments: Arguments, folder: RunFolder) -> Run:
         raise UserError("format=minari needs Minari: pip install 'minari[hdf5]'") from error
     root = get_dataset_path() if arguments.out is None else user_path(arguments.out)
     is_simulated = arguments.backend == "sim"
-    run = load_run(folder.path, None if is_simulated else "c", arguments.policy or BEST)
-    task = require_model(run.task)
-    if not is_simulated:
-        check_task(task)
-    path = root / dataset_id(run, arguments.backend)
-    check_absent(path)
-    parsing.check_writable(path)
-    scores = write_dataset(root, run, arguments.episodes, arguments.seed, arguments.backend)
-    print(f"{path}: episodes of the {run.policy_name} policy (step {run.policy_metadata['env_steps']:,})")
-    print(f"{scores}", "Load it in a shell and in Python:", sep="\n")
+    runs = {
+        quality: load_run(folder.path, None if is_simulated else "c", policy)
+        for quality, policy in _qualities(arguments, folder).items()
+    }
+    for quality, run in runs.items():
+        if not is_simulated:
+            check_task(require_model(run.task))
+        path = root / dataset_id(run, arguments.backend, quality)
+        check_absent(path)
+        parsing.check_writable(path)
+    for quality, run in runs.items():
+        scores = write_dataset(root, run, arguments.episodes, arguments.seed, arguments.backend, quality)
+        path = root / dataset_id(run, arguments.backend, quality)
+        print(f"{path}: episodes of the {run.policy_name} policy ({_place(run.policy_metadata)})", scores, sep="\n")
+    print("Load it in a shell and in Python:" if len(runs) == 1 else "Load them in a shell and in Python:")
     print(f"  export MINARI_DATASETS_PATH={shlex.quote(str(root.absolute()))}")
-    print(f'  dataset = minari.load_dataset("{dataset_id(run, arguments.backend)}")')
+    for quality, run in runs.items():
+        print(f'  {quality or "dataset"} = minari.load_dataset("{dataset_id(run, arguments.backend, quality)}")')
     return run
+
+
+def _qualities(arguments: Arguments, folder: RunFolder) -> dict[str | None, str]:
+    """The policies to play, by the names of their datasets; by None for a dataset with the name of the policy.
+
+    Raises:
+        UserError: unknown names, or the run has not kept one of the policies.
+    """
+    if arguments.policies is None:
+        return {None: arguments.policy or BEST}
+    if arguments.policy:
+        raise UserError("give policy=NAME or policies=NAME,NAME, not both")
+    names = arguments.policies.split(",")
+    if len({*names}) < len(names) or not {*names} <= _QUALITIES.keys():
+        raise UserError(f"policies={arguments.policies}: give some of: {','.join(_QUALITIES)}")
+    for name in names:
+        if choose_policy(folder, _QUALITIES[name]) != _QUALITIES[name]:
+            raise UserError(f"{folder.path} has no {_QUALITIES[name]} policy yet; resume its training")
+    return {name: _QUALITIES[name] for name in names}
+
+
+_QUALITIES = {"expert": BEST, **{name: name for name in MILESTONES}}
+"""Policies by the names that Minari and D4RL have for their quality."""
+
+
+def _place(metadata: Metadata) -> str:
+    """Where in the training a policy is."""
+    step = f"step {metadata['env_steps']:,}"
+    return f"{step}, {metadata['fraction']:.0%} of the way to the best" if "fraction" in metadata else step
 
 
 def _export_torch(arguments: Arguments, folder: RunFolder) -> Run:

@@ -22,11 +22,12 @@ from mjx_walk.viewing.viewer import show
 __all__ = ["USAGE", "Arguments", "main"]
 
 USAGE = """
-usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [policy=best|final] [seed=0] [width=640] [height=480] [out=FILE.mp4]
+usage: python -m mjx_walk.play run=RUN_DIR|zoo:NAME [policy=NAME] [seed=0] [width=640] [height=480] [out=FILE.mp4]
                                [html=FILE.html] [gait=FILE.png] [strip=FILE.png start=5 seconds=1] [viewer=true]
 
   policy=best     the policy with the highest evaluation during training or at its end; policy=final is the newest one,
-                  which eval scores by default
+                  which eval scores by default. policy=medium and policy=simple are about two thirds and one third of
+                  the way from the first evaluation to the best one, after a training with checkpoint.milestones=true.
   out=FILE.mp4    a film of one episode. It is written by default, as RUN_DIR/episode.mp4 or, for a policy of the zoo,
                   as NAME.mp4 in the current folder.
   html=FILE.html  a page that plays the episode in 3D with its reward terms, in any browser, offline (pip install

@@ -33,6 +33,7 @@ from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.envs import make_env
 from mjx_walk.experiments import planned_runs, trials
 from mjx_walk.settings.config import load_config
+from mjx_walk.storage.scores import MILESTONES
 from mjx_walk.training.trainer import Trainer
 
 RESULTS = (CLONE / "docs" / "results.md").read_text()
@@ -165,6 +166,8 @@ def all_commands():
 def small_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("readme") / "run"
     mjx_walk.run([*TINY, f"run_dir={folder}", "total_steps=1", "evaluation.gymnasium_episodes=1"])
+    for name in MILESTONES:  # `training/test_milestones.py` trains for them
+        shutil.copytree(folder / "checkpoints" / "best", folder / "checkpoints" / name)
     return folder
 
 

@@ -29,7 +29,7 @@ from mjx_walk.storage.files import write_text
 from mjx_walk.storage.folders import replacing_folder
 from mjx_walk.storage.scores import Scores
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.versions import package_versions
+from mjx_walk.utils.versions import git_commit, package_versions
 from mjx_walk.viewing.episode import make_gymnasium
 
 __all__ = ["check_absent", "check_task", "dataset_id", "write_dataset"]
@@ -41,14 +41,21 @@ _REQUIREMENTS = ("mujoco", "gymnasium")
 """Packages whose versions the episodes depend on. Minari warns if another version is installed."""
 
 
-def dataset_id(saved: SavedPolicy, backend: str) -> str:
+def dataset_id(saved: SavedPolicy, backend: str, quality: str | None = None) -> str:
     """Minari's id of a policy's dataset, such as `mjx_walk/walker2d/csac-v0` from the zoo.
 
     A run gives `mjx_walk/walker2d/csac-best-v0` or `…/csac-final-v0`. With the backend `sim`, it is `…/csac-sim-v0`.
+
+    Args:
+        saved: the policy.
+        backend: as for `write_dataset`.
+        quality: a name for the policy, such as `expert`, which gives `…/csac-expert-v0`.
     """
-    task, algorithm = saved.config.env.name, saved.config.algo.name
-    name = saved.path.name.removeprefix(f"{task}-") if zoo.holds(saved.path) else f"{algorithm}-{saved.policy_name}"
-    return f"{_NAMESPACE}/{task}/{name}{'-sim' if backend == 'sim' else ''}-v0"
+    task, is_shipped = saved.config.env.name, zoo.holds(saved.path)
+    name = saved.path.name.removeprefix(f"{task}-") if is_shipped else saved.config.algo.name
+    named = quality or ("" if is_shipped else saved.policy_name)
+    parts = (name, named, "sim" if backend == "sim" else "", "v0")
+    return f"{_NAMESPACE}/{task}/{'-'.join(filter(None, parts))}"
 
 
 def check_absent(path: Path) -> None:
@@ -82,7 +89,9 @@ def _missing_in_gymnasium(task: Task) -> str:
     return f"without your model {xml_file}" if xml_file and not is_asset(xml_file) else ""
 
 
-def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int, backend: str) -> Scores:
+def write_dataset(
+    root: Path, saved: SavedPolicy, num_episodes: int, seed: int, backend: str, quality: str | None = None
+) -> Scores:
     """Play a policy, and write its episodes as a dataset of Minari.
 
     The dataset appears below `root` when it is complete. The policy acts without noise.
@@ -93,6 +102,7 @@ def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int, 
         num_episodes: N.
         seed: in Gymnasium, episode i is reset with `seed + i`. In the engine, all starts are drawn from it.
         backend: `gymnasium`, the real environment, or `sim`, the task's own engine.
+        quality: as for `dataset_id`.
 
     Returns:
         The returns and lengths of the episodes.
@@ -101,13 +111,14 @@ def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int, 
         UserError: the dataset exists already.
         OSError: the disk is full, or cannot be written.
     """
-    path = root.absolute() / dataset_id(saved, backend)  # Minari measures the size of absolute paths only
+    dataset = dataset_id(saved, backend, quality)
+    path = root.absolute() / dataset  # Minari measures the size of absolute paths only
     check_absent(path)
     namespaces = (path.parent, path.parent.parent)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with as_by_ctrl_c(), replacing_folder(path) as folder:
-            scores = _write(folder / "data", saved, num_episodes, seed, backend)
+            scores = _write(folder / "data", dataset, saved, num_episodes, seed, backend)
         for namespace in namespaces:
             if not (namespace / NAMESPACE_METADATA_FILENAME).exists():
                 write_text(namespace / NAMESPACE_METADATA_FILENAME, "{}")
@@ -118,7 +129,7 @@ def write_dataset(root: Path, saved: SavedPolicy, num_episodes: int, seed: int, 
     return scores
 
 
-def _write(folder: Path, saved: SavedPolicy, num_episodes: int, seed: int, backend: str) -> Scores:
+def _write(folder: Path, dataset: str, saved: SavedPolicy, num_episodes: int, seed: int, backend: str) -> Scores:
     """Write the files of a dataset."""
     task = require_model(saved.task)
     storage = _new_storage(folder, task)
@@ -136,7 +147,7 @@ def _write(folder: Path, saved: SavedPolicy, num_episodes: int, seed: int, backe
     storage.update_episode_metadata(map(EpisodeMetadataCallback(), ({"rewards": own} for own in rewards)))
     returns, lengths = np.array([own.sum() for own in rewards]), np.array([len(own) for own in rewards])
     scores = Scores(returns, lengths, seeds, name)
-    storage.update_metadata(_metadata(saved, scores, backend))
+    storage.update_metadata(_metadata(dataset, saved, scores, backend))
     return scores
 
 
@@ -169,13 +180,13 @@ def _buffers(episodes: Iterable[RecordedEpisode], rewards: list[np.ndarray], fol
         yield EpisodeBuffer(**{field.name: getattr(episode, field.name) for field in dataclasses.fields(episode)})
 
 
-def _metadata(saved: SavedPolicy, scores: Scores, backend: str) -> dict[str, object]:
+def _metadata(dataset: str, saved: SavedPolicy, scores: Scores, backend: str) -> dict[str, object]:
     """Facts about the dataset: Minari's own, and those that Minari has no name for under `mjx_walk`."""
-    policy, env_steps = saved.policy_name, saved.policy_metadata["env_steps"]
+    policy, metadata = saved.policy_name, saved.policy_metadata
     source = f"{zoo.PREFIX if zoo.holds(saved.path) else ''}{saved.path.name}"  # the path may name the user
-    versions = package_versions()
+    versions, commit = package_versions(), git_commit()
     return {
-        "dataset_id": dataset_id(saved, backend),
+        "dataset_id": dataset,
         "minari_version": minari.__version__,
         "algorithm_name": saved.config.algo.name,
         "description": f"Episodes of the {policy} policy of {source} in {scores.env}, without noise.",
@@ -183,7 +194,8 @@ def _metadata(saved: SavedPolicy, scores: Scores, backend: str) -> dict[str, obj
         "mjx_walk": {
             "run": source,
             "policy": policy,
-            "env_steps": env_steps,
+            "env_steps": metadata["env_steps"],
+            **({"fraction": metadata["fraction"]} if "fraction" in metadata else {}),
             "backend": backend,
             "physics": saved.task.engine.name if backend == "sim" else "c",
             "action_noise": "none",
@@ -191,5 +203,6 @@ def _metadata(saved: SavedPolicy, scores: Scores, backend: str) -> dict[str, obj
             "mean_return": scores.mean,
             "std_return": scores.std,
             "versions": versions,
+            **({"commit": commit} if commit else {}),
         },
     }

@@ -9,18 +9,21 @@ from collections import namedtuple
 
 import numpy as np
 import pytest
-from helpers import CLONE, ENVIRONMENT, OLD_RUNS, blocks, command_here, edit_config
+from helpers import CLONE, ENVIRONMENT, OLD_RUNS, blocks, command_here, edit_config, train_here
 from small_robot import small_robot
 
 import mjx_walk
 from mjx_walk.envs import make_env
 from mjx_walk.envs.model_files import ASSETS
 from mjx_walk.evaluation import recorded_episodes, simulated_episodes
+from mjx_walk.storage.checkpoint_metadata import read_metadata, write_metadata
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.versions import git_commit
 
 minari = pytest.importorskip("minari", reason="pip install 'minari[hdf5]'")
 from mjx_walk.interop.minari import check_task  # noqa: E402
 
+KEEPS_ONE = "a complete training with checkpoint.milestones=true keeps one"
 REACHER = "mjx_walk/reacher/csac-v0"
 
 
@@ -167,6 +170,63 @@ def test_a_clone_reaches(datasets):
     assert done.returncode == 0, done.stderr
     means = {who: float(value) for who, value in re.findall(r"^(\w+): ([-\d.]+) ±", done.stdout, re.MULTILINE)}
     assert means["untrained"] < -20 < -6 < means["clone"] and -5 < means["dataset"] < -2
+
+
+def test_datasets_of_several_policies(datasets, tmp_path, monkeypatch, capsys):
+    """They hold the episodes of `policy=`, under names of their own."""
+    run = shutil.copytree(datasets / ".runs" / "falls", tmp_path / "run")
+    for name in ("medium", "simple"):
+        shutil.copytree(run / "checkpoints" / "best", run / "checkpoints" / name)
+    metadata = read_metadata(run / "checkpoints" / "medium" / "meta.json")
+    write_metadata(run / "checkpoints" / "medium" / "meta.json", metadata | {"fraction": 0.6})
+    out = ("episodes=2", "seed=7", f"out={tmp_path / 'new'}")
+    assert export(f"run={run}", "policies=expert,medium", *out) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"medium policy \(step [\d,]+, 60% of the way to the best\)\nWalker2d-v4: ", said)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "new"))
+    for quality, policy, fraction in (("expert", "best", None), ("medium", "medium", 0.6)):
+        name = f"mjx_walk/walker2d/ppo-{quality}-v0"
+        assert f'  {quality} = minari.load_dataset("{name}")' in said
+        dataset = minari.load_dataset(name)
+        assert_repeats(dataset, [7, 8])
+        own = dataset.storage.metadata["mjx_walk"]
+        assert (own["policy"], own["seed"], own.get("fraction")) == (policy, 7, fraction)
+        assert own.get("commit") == git_commit()
+    assert export(f"run={run}", "policies=simple,expert", *out) == 2
+    assert "ppo-expert-v0 exists already" in capsys.readouterr().err
+    assert not (tmp_path / "new" / "mjx_walk" / "walker2d" / "ppo-simple-v0").exists()
+
+
+@pytest.mark.slow
+def test_a_training_gives_three_qualities(tmp_path, monkeypatch):
+    """A pendulum that learns to balance for longer."""
+    settings = ("num_envs=64", "total_steps=16_384", "iterations_per_call=1", "algo.unroll_length=16")
+    further = ("evaluation.num_envs=16", "evaluation.gymnasium_episodes=0", "checkpoint.milestones=true")
+    train_here(tmp_path / "run", "hardware=cpu", *settings, *further, tiny=["env=inverted_pendulum"])
+    out = ("policies=expert,medium,simple", "episodes=20", f"out={tmp_path / 'new'}")
+    assert export(f"run={tmp_path / 'run'}", *out) == 0
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "new"))
+    names = [f"mjx_walk/inverted_pendulum/ppo-{quality}-v0" for quality in ("simple", "medium", "expert")]
+    means = [minari.load_dataset(name).storage.metadata["mjx_walk"]["mean_return"] for name in names]
+    assert 20 < means[0] < means[1] < means[2]
+
+
+def test_a_run_without_milestones_says_how_to_keep_them(tmp_path, capsys):
+    run = OLD_RUNS / "ppo"
+    for arguments, message in (
+        (("policies=expert,medium",), f"{run} has no medium policy; {KEEPS_ONE}"),
+        (("policy=simple",), f"{run} has no simple policy; {KEEPS_ONE}"),
+        (("policies=best",), "policies=best: give some of: expert,medium,simple"),
+        (("policies=",), "policies=: give some of: expert,medium,simple"),
+        (("policies=expert", "policy=best"), "give policy=NAME or policies=NAME,NAME, not both"),
+        (
+            ("policies=expert", "format=onnx"),
+            "policies=expert has no effect with format=onnx; change that, or leave it out",
+        ),
+    ):
+        assert export(f"run={run}", f"out={tmp_path}/new", *arguments) == 2
+        assert capsys.readouterr().err == f"error: {message}\n"
+    assert not os.listdir(tmp_path)
 
 
 def test_what_gymnasium_cannot_replay_is_refused(tmp_path):
