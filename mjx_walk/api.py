@@ -38,7 +38,7 @@ from mjx_walk.storage.scores import BEST, Scores
 from mjx_walk.training.checks import as_saved, check_replay, prepared
 from mjx_walk.training.distributed import Processes, per_device
 from mjx_walk.training.init_from import read_networks
-from mjx_walk.training.messages import announce
+from mjx_walk.training.messages import announce, resume_command
 from mjx_walk.training.trainer import Trainer
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.setting_fields import validate
@@ -201,7 +201,7 @@ def train(
             if not signal_name:
                 _score(trainer, folders)
             elif processes.is_main_process:
-                _LOGGER.info("Stopped by %s and saved. To continue: %s", signal_name, _resume_command(configs, folders))
+                _LOGGER.info("Stopped by %s and saved. To continue: %s", signal_name, resume_command(configs, folders))
     return folders, signal_name
 
 
@@ -242,16 +242,6 @@ def _score(trainer: Trainer, folders: list[RunFolder]) -> None:
                 where = shlex.quote(f"run={folder.path}")
                 _LOGGER.info("Trained and saved, not scored. To score: python -m mjx_walk.eval %s", where)
         raise
-
-
-def _resume_command(configs: list[Config], folders: list[RunFolder]) -> str:
-    where = shlex.quote(f"run_dir={folders[0].path}")
-    if len(folders) > 1:
-        where = f"{shlex.quote(f'run_dir={folders[0].path.parent}')} 'seeds={[config.seed for config in configs]}'"
-    env = configs[0].env
-    named = {KEY: env.task, "env.reward_function": env.reward_function, "wandb_project": configs[0].wandb_project}
-    again = "".join(f" {shlex.quote(f'{key}={value}')}" for key, value in named.items() if value)
-    return f"python -m mjx_walk.train {where} resume=true{again}"
 
 
 def run(

@@ -10,13 +10,25 @@ from mjx_walk.algos import TrainState, learned_leaves
 from mjx_walk.envs import TASKS, Task
 from mjx_walk.machine.devices import default_device
 from mjx_walk.settings.config import Config
+from mjx_walk.settings.own_tasks import KEY
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import BEST, FINAL, Scores
 from mjx_walk.utils.text import duration
 
-__all__ = ["announce", "choice_line", "divergence", "end_lines", "score_lines"]
+__all__ = ["announce", "choice_line", "divergence", "end_lines", "resume_command", "score_lines"]
 
 _LOGGER = logging.getLogger(__name__)
+
+
+def resume_command(configs: list[Config], folders: list[RunFolder]) -> str:
+    """The command that continues the runs of a process, which differ in their seed."""
+    where = shlex.quote(f"run_dir={folders[0].path}")
+    if len(folders) > 1:
+        where = f"{shlex.quote(f'run_dir={folders[0].path.parent}')} 'seeds={[config.seed for config in configs]}'"
+    env = configs[0].env
+    named = {KEY: env.task, "env.reward_function": env.reward_function, "wandb_project": configs[0].wandb_project}
+    again = "".join(f" {shlex.quote(f'{key}={value}')}" for key, value in named.items() if value)
+    return f"python -m mjx_walk.train {where} resume=true{again}"
 
 
 def announce(config: Config, folders: list[RunFolder], num_devices: int) -> None:

@@ -32,7 +32,7 @@ def test_the_card_has_the_facts_that_the_hub_reads(folder):
     assert model["name"] == "reacher" and result["dataset"]["name"] == "Reacher-v5"
     assert result["metrics"][0]["value"].startswith(f"{mean:.2f} +/- ") and f"| {mean:,.1f} | " in page
     assert {"Reacher-v5", "csac", "reinforcement-learning"} <= {*facts["tags"]}
-    assert "python -m mjx_walk.train env=reacher algo=csac\n" in page
+    assert "python -m mjx_walk.train env=reacher algo=csac algo.n_step=5 algo.noise_repeat=8\n" in page
     assert (folder / "replay.mp4").exists() == ("replay.mp4" in page)
 
 
