@@ -29,6 +29,7 @@ from mjx_walk.storage.files import check_replaceable, open_to_append, refuse_lin
 from mjx_walk.storage.locks import locked
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.training.checks import locked_folder
+from mjx_walk.training.goal import has_reached
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.text import format_score
 
@@ -66,9 +67,10 @@ class PlannedRun:
 
     @property
     def is_finished(self) -> bool:
-        """Whether it has logged all its steps, and been scored if its settings ask for that."""
+        """Whether it has logged all its steps or reached its goal, and been scored if its settings ask for that."""
         rows = read_rows(self.folder.metrics) if self.folder.is_run else []
-        if not rows or rows[-1]["env_steps"] < self.config.total_steps:
+        is_long_enough = bool(rows) and rows[-1]["env_steps"] >= self.config.total_steps
+        if not (is_long_enough or has_reached(rows, self.config.stop_at_return)):
             return False
         return not self.config.evaluation.gymnasium_episodes or self.folder.gymnasium_scores.exists()
 

@@ -21,6 +21,7 @@ _RESERVED = {
     "seed": "write seeds=[{}]",
     "run_dir": "write out={}",
     "resume": "leave it out, since the same command continues a study",
+    "stop_at_return": "leave it out, since trials are compared after the same number of steps",
 }
 """Settings of a run that a study chooses itself, and what to write instead."""
 _ONE_OF_THEM = ("env", "algo", "recipe", "hardware", "env.task")

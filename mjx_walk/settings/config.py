@@ -112,7 +112,7 @@ def with_absolute_paths(config: Config, folder: Path) -> Config:
     """
     run_dir = str(user_path(config.run_dir)) if config.run_dir is not None else None
     source = config.init_from
-    if source and not source.startswith(PREFIX):
+    if source is not None and not source.startswith(PREFIX):
         source = str(folder / user_path(source))
     env = envs.with_absolute_paths(config.env, folder)
     config = dataclasses.replace(config, run_dir=run_dir, init_from=source, env=env)

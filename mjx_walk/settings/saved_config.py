@@ -29,6 +29,7 @@ __all__ = [
     "differences",
     "in_short",
     "name_same_file",
+    "read_algorithm",
     "read_config",
     "read_saved_config",
     "save_config",
@@ -99,6 +100,19 @@ def read_saved_config(folder: RunFolder) -> Config:
     for key in MAY_DIFFER:
         config = with_setting(config, key, operator.attrgetter(key)(present))
     return config
+
+
+def read_algorithm(folder: RunFolder) -> dict[str, object]:
+    """The settings of a run's algorithm, and its `name`. Neither its task nor its reward function needs to be known.
+
+    Raises:
+        UserError: there is no configuration that this version reads.
+    """
+    path = folder.config_copy() or folder.config
+    saved = _read(path)
+    with _errors_that_name(path):
+        settings: dict[str, object] = dict(OmegaConf.to_object(saved.algo))  # type: ignore[arg-type]
+        return {"name": str(settings.pop("name")), **settings}
 
 
 def _warn_of_edits(trained: Config, present: Config, file: Path, copy: Path) -> None:

@@ -236,7 +236,7 @@ def restore_newest(
         raise problems[0]
     for problem in problems:
         warnings.warn(str(problem), stacklevel=2)
-    raise UserError(f"no usable checkpoint in {folder}; start a new run without resume=true")
+    raise UserError(f"no usable checkpoint in {folder}; restore it from a backup, or train again in another folder")
 
 
 def _check_steps(path: Path, meta: Metadata) -> None:

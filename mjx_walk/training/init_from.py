@@ -1,6 +1,7 @@
 """The networks that a training begins with, if they come from another run or from the zoo."""
 
 import logging
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -12,7 +13,7 @@ from mjx_walk import zoo
 from mjx_walk.algos import Algorithm, TrainState, with_replay_of, without_replay
 from mjx_walk.evaluation.saved_policies import choose_policy, load_policy
 from mjx_walk.settings.config import Config
-from mjx_walk.settings.saved_config import read_saved_config
+from mjx_walk.settings.saved_config import read_algorithm
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import BEST
@@ -22,6 +23,11 @@ from mjx_walk.utils.types import PolicyParams, leaves_with
 __all__ = ["Networks", "begin_with", "read_networks"]
 
 _LOGGER = logging.getLogger(__name__)
+_ACTING = ("activation", "distribution", "observation_clip")
+"""Settings of algorithms that change the actions of a policy, but not the sizes of its networks."""
+_POLICY_SIZES = ("policy_hidden_layer_sizes", "policy_layer_norm", "state_dependent_std")
+_SIZES = (*_POLICY_SIZES, "value_hidden_layer_sizes", "critic_hidden_layer_sizes", "critic_layer_norm", "num_atoms")
+"""Settings of algorithms that change the sizes of networks, those of the policy first."""
 
 
 class Networks(NamedTuple):
@@ -48,24 +54,21 @@ def read_networks(config: Config, algorithm: Algorithm) -> Networks | None:
     if not config.init_from or (config.resume and _has_checkpoint(RunFolder(Path(str(config.run_dir))))):
         return None
     folder = zoo.open_run(config.init_from)
-    shapes = algorithm.state_shapes()
+    source = read_algorithm(folder)
+    is_same = source["name"] == config.algo.name and _has_checkpoint(folder)
     try:
-        if read_saved_config(folder).algo.name == config.algo.name and _has_checkpoint(folder):
-            leaves, metadata = checkpoint.restore_newest(folder.checkpoints, _inherited(shapes))
-            _LOGGER.info(f"Training begins with the networks of {config.init_from}, step {metadata['env_steps']:,}")
-            return Networks(cast(dict[str, Array], leaves), None)
-        name = choose_policy(folder, BEST)
-        policy, metadata = load_policy(folder, name, jax.eval_shape(algorithm.policy_params, shapes))
+        networks, described = (_all_networks if is_same else _best_policy)(folder, algorithm)
     except UserError as error:
         if "should be" not in str(error):
             raise
         found = str(error).rpartition(": ")[2]
-        raise UserError(f"init_from={config.init_from} has networks of other sizes: {found}") from error
-    _LOGGER.info(
-        f"Training begins with the {name} policy of {config.init_from}, step {metadata['env_steps']:,}; "
-        "other networks begin anew"
-    )
-    return Networks({}, policy)
+        differing = _differing(config, source, (*(_SIZES if is_same else _POLICY_SIZES), *_ACTING))
+        advice = "".join(f" algo.{name}={str(value).replace(' ', '')}" for name, value in differing.items())
+        also = f"; its own networks need{advice}" if advice else ""
+        raise UserError(f"init_from={config.init_from} has networks of other sizes: {found}{also}") from error
+    _LOGGER.info(f"Training begins with the {described.format(config.init_from)}")
+    _warn_of_other_actions(config, source)
+    return networks
 
 
 def begin_with(algorithm: Algorithm, state: TrainState, networks: Networks) -> TrainState:
@@ -85,6 +88,47 @@ def begin_with(algorithm: Algorithm, state: TrainState, networks: Networks) -> T
     # Copies, since the step consumes every array once.
     rest = jax.tree.map(lambda new, old: jnp.array(new, old.dtype), rest, without_replay(state))
     return with_replay_of(state, rest)
+
+
+def _all_networks(folder: RunFolder, algorithm: Algorithm) -> tuple[Networks, str]:
+    """The networks of the newest checkpoint, and what they are, with `{}` for the run."""
+    leaves, metadata = checkpoint.restore_newest(folder.checkpoints, _inherited(algorithm.state_shapes()))
+    return Networks(cast(dict[str, Array], leaves), None), f"networks of {{}}, step {metadata['env_steps']:,}"
+
+
+def _best_policy(folder: RunFolder, algorithm: Algorithm) -> tuple[Networks, str]:
+    """The best policy, and what it is, with `{}` for the run."""
+    name = choose_policy(folder, BEST)
+    policy, metadata = load_policy(folder, name, jax.eval_shape(algorithm.policy_params, algorithm.state_shapes()))
+    described = f"{name} policy of {{}}, step {metadata['env_steps']:,}; other networks begin anew"
+    return Networks({}, policy), described
+
+
+def _warn_of_other_actions(config: Config, source: Mapping[str, object]) -> None:
+    """Name the settings because of which the same networks act differently."""
+    for name, value in _differing(config, source, _ACTING).items():
+        own = getattr(config.algo, name)
+        _LOGGER.warning(
+            f"{config.init_from} was trained with algo.{name}={value}, and this run has {own}: "
+            "the same networks act differently"
+        )
+
+
+def _differing(config: Config, source: Mapping[str, object], names: Iterable[str]) -> dict[str, object]:
+    """Those of some settings that differ, with the value of the algorithm from which the networks come.
+
+    Args:
+        config: of the training.
+        source: settings of that algorithm.
+        names: settings. Those that an algorithm lacks are left out.
+    """
+    common = [name for name in names if name in source and hasattr(config.algo, name)]
+    own = {name: getattr(config.algo, name) for name in common}
+    return {name: source[name] for name in common if _plain(own[name]) != _plain(source[name])}
+
+
+def _plain(value: object) -> object:
+    return list(value) if isinstance(value, list | tuple) else value
 
 
 def _has_checkpoint(folder: RunFolder) -> bool:

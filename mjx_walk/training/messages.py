@@ -15,7 +15,7 @@ from mjx_walk.storage.run_folder import RunFolder
 from mjx_walk.storage.scores import BEST, FINAL, Scores
 from mjx_walk.utils.text import duration
 
-__all__ = ["announce", "choice_line", "divergence", "end_lines", "resume_command", "score_lines"]
+__all__ = ["announce", "choice_line", "divergence", "end_lines", "resume_command", "say_length", "score_lines"]
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -62,6 +62,26 @@ def announce(config: Config, folders: list[RunFolder], num_devices: int) -> None
         _LOGGER.info("On the first run on a machine, Warp compiles its kernels, which takes half a minute or more.")
         if config.profile_calls > 1 and num_devices == 1:
             _LOGGER.warning("JAX's profiler has hung in a second recorded call of Warp on one GPU; use profile_calls=1")
+
+
+def say_length(config: Config, env_steps: int, steps_per_call: int, is_complete: bool, has_reached: bool) -> None:
+    """Log whether the run is already complete, or whether `total_steps` is rounded up.
+
+    Args:
+        config: of the run.
+        env_steps: environment steps of the complete training.
+        steps_per_call: environment steps of a call.
+        is_complete: whether the run has had them all.
+        has_reached: whether the run has reached its `stop_at_return`.
+    """
+    if is_complete:
+        _LOGGER.info(f"The run has already completed its {env_steps:,} steps; to continue, give a larger total_steps")
+    elif has_reached:
+        goal = f"stop_at_return={config.stop_at_return:,}"
+        _LOGGER.info(f"The run has already reached {goal}; to continue, give a higher one, or stop_at_return=null")
+    elif env_steps != config.total_steps:
+        total = f"total_steps={config.total_steps:,}"
+        _LOGGER.info(f"{total} is rounded up to {env_steps:,}: a call has {steps_per_call:,} steps")
 
 
 def divergence(states: list[TrainState], seeds: list[int], env_steps: int) -> str:

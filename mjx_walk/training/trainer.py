@@ -21,7 +21,7 @@ from mjx_walk.training.call_profile import CallProfile
 from mjx_walk.training.distributed import Processes
 from mjx_walk.training.goal import Goal
 from mjx_walk.training.init_from import Networks, begin_with
-from mjx_walk.training.messages import divergence, end_lines
+from mjx_walk.training.messages import divergence, end_lines, say_length
 from mjx_walk.training.milestones import KeptPolicies
 from mjx_walk.training.programs import compile_together, make_program
 from mjx_walk.training.recorder import Recorder
@@ -94,19 +94,23 @@ class Trainer:
         """
         restored, metadata = self._restored()
         call, self._first_steps = divmod(metadata[0].get("env_steps", 0), self._steps_per_call)
-        self._say_total(call)
+        if restored is not None:
+            self._goal.recall(self._folders, self._env_steps(call))
         is_main = self._processes.is_main_process
+        length = self._env_steps(self._num_calls), self._steps_per_call
+        if is_main:
+            say_length(self._config, *length, call >= self._num_calls, self._goal.is_reached)
         progress = Progress(self._env_steps(self._num_calls), self._env_steps(call), is_main)
         profile = CallProfile(self._folders[0].profile, self._config.profile_calls if is_main else 0)
         state = self._ready_to_call(restored, call)
         speed = Speed(call)
         for recorder, saved in zip(self._recorders, metadata, strict=True):
-            recorder.begin(self._env_steps(call), call < self._num_calls, saved)
+            recorder.begin(self._env_steps(call), not self._is_over(call), saved)
         self._take_snapshots(state, call)
         saved_call, is_finite = call if restored is not None else None, True
         with Interrupt() as interrupt, profile:
             signal_name = self._stop_signal(interrupt)
-            while call < self._num_calls and is_finite and not signal_name and not self._goal.is_reached:
+            while not self._is_over(call) and is_finite and not signal_name:
                 profile.next_call()
                 state, metrics = self._program.run_call(state)
                 call += 1
@@ -174,19 +178,12 @@ class Trainer:
         """Environment steps of a run after so many calls."""
         return self._first_steps + call * self._steps_per_call
 
-    def _say_total(self, call: int) -> None:
-        """Log whether the run is already complete, or whether `total_steps` is rounded up."""
-        total, steps = self._config.total_steps, self._env_steps(self._num_calls)
-        if not self._processes.is_main_process:
-            return
-        if call >= self._num_calls:
-            _LOGGER.info(f"The run has already completed its {steps:,} steps; to continue, give a larger total_steps")
-        elif steps != total:
-            _LOGGER.info(f"total_steps={total:,} is rounded up to {steps:,}: a call has {self._steps_per_call:,} steps")
+    def _is_over(self, call: int) -> bool:
+        return call >= self._num_calls or self._goal.is_reached
 
     def _ready_to_call(self, restored: TrainState | None, call: int) -> TrainState:
         """The state for the next call, if there is one. Compiles the programs while the engine gets ready."""
-        if restored is not None and call >= self._num_calls:
+        if restored is not None and self._is_over(call):
             return restored
         with nothing_runs():
             programs = self._program.lower(self._keys, restored)

@@ -1,19 +1,23 @@
 """A training begins with the networks of another one, and ends at a return."""
 
 import dataclasses
+import json
+import logging
 import shutil
 
 import jax
 import numpy as np
 import pytest
-from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command_here, train_here
+from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command_here, edit_config, fake_run, train_here
 
 import mjx_walk
 from mjx_walk.algos import make_algorithm
 from mjx_walk.evaluation.saved_policies import make_task
+from mjx_walk.experiments.planned_runs import PlannedRun
 from mjx_walk.settings.config import load_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.run_folder import RunFolder
+from mjx_walk.training.goal import Goal
 from mjx_walk.training.init_from import begin_with, read_networks
 from mjx_walk.training.programs import make_init
 
@@ -120,16 +124,48 @@ def test_several_seeds_begin_with_the_same_networks(runs, tmp_path):
         assert (own["normalizer.mean"] != source["normalizer.mean"]).any()
 
 
+def test_the_code_of_the_source_is_not_needed(runs, tmp_path):
+    """Neither its task nor its reward function, which may be somebody else's."""
+    source = shutil.copytree(runs / "ppo", tmp_path / "source")
+    edit_config(source, "  name: walker2d\n", "  name: lost_robot\n")
+    edit_config(source, "  reward_function: null\n", "  reward_function: /lost/reward.py:f\n")
+    _, after = begun(*TINY, f"init_from={source}")
+    expected = saved(runs / "ppo")
+    for name in (name for name in expected if name.startswith("params.")):
+        np.testing.assert_array_equal(after[name], expected[name], err_msg=name)
+
+
+def test_settings_with_which_the_same_networks_act_differently_are_named(runs, caplog):
+    with caplog.at_level(logging.WARNING, "mjx_walk"):
+        begun(
+            *TINY, f"init_from={runs / 'ppo'}", "algo.activation=relu", "algo.observation_clip=5", "algo.discount=0.9"
+        )
+    assert [record.message.partition(" was trained with ")[2] for record in caplog.records] == [
+        "algo.activation=tanh, and this run has relu: the same networks act differently",
+        "algo.observation_clip=10.0, and this run has 5.0: the same networks act differently",
+    ]
+
+
 @pytest.mark.parametrize(
     ("source", "settings", "says"),
     [
         ("ppo", ("env=hopper",), "has networks of other sizes: normalizer.mean should be (11,) float32, found (17,)"),
-        ("ppo", ("algo.policy_hidden_layer_sizes=[16]",), "has networks of other sizes: params.policy."),
+        (
+            *("ppo", ("algo.policy_hidden_layer_sizes=[16]", "algo.activation=relu")),
+            "; its own networks need algo.policy_hidden_layer_sizes=[64,64] algo.activation=tanh",
+        ),
+        (
+            *("ppo", ("init_from=zoo:walker2d-ppo", "algo.activation=swish")),
+            "; its own networks need algo.policy_hidden_layer_sizes=[256,256,128]",
+        ),
         ("nothing", (), "no run at"),
+        ("ppo", ("init_from=",), "a path is empty"),
+        ("ppo", ("init_from=zoo:walker2d-none",), "no policy 'walker2d-none' in the zoo"),
     ],
 )
 def test_what_does_not_fit_is_refused_before_a_folder_is_made(runs, tmp_path, capsys, source, settings, says):
-    arguments = (*TINY, *settings, f"init_from={runs / source}", f"run_dir={tmp_path}/run")
+    source = () if "init_from" in str(settings) else (f"init_from={runs / source}",)
+    arguments = (*TINY, *settings, *source, f"run_dir={tmp_path}/run")
     assert command_here("train", *arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: ") and says in line and not (tmp_path / "run").exists()
@@ -144,8 +180,39 @@ def test_training_ends_at_a_return_and_is_complete(tmp_path, capsys):
     output = capsys.readouterr().out
     assert f"Training ends at step {int(rows[-1]['env_steps']):,}: every evaluation has reached -100.0" in output
     assert "Final policy (step" in output and (tmp_path / "run" / "eval_gymnasium.json").exists()
+    train_here(tmp_path / "run", "resume=true", tiny=())
+    assert mjx_walk.load_run(tmp_path / "run", physics="c").metrics == rows
+    assert "The run has already reached stop_at_return=-100.0; to continue" in capsys.readouterr().out
     train_here(tmp_path / "run", "resume=true", "stop_at_return=1_000_000", tiny=())
     assert mjx_walk.load_run(tmp_path / "run", physics="c").metrics[-1]["env_steps"] == 20 * TINY_CALL
+
+
+def log_of(folder, *returns):
+    """A run whose rows have these evaluations, of which None is missing."""
+    fake_run(folder, [*TINY, "algo=ppo", "total_steps=5_000_000", "stop_at_return=10"], [0.0] * len(returns))
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    rows = [row | {"eval/return": value} for row, value in zip(rows, returns, strict=True)]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return RunFolder(folder)
+
+
+def test_a_goal_that_one_of_two_seeds_has_reached_before_a_resume_counts(tmp_path):
+    folders = [log_of(tmp_path / "a", 1.0, 12.0, 3.0), log_of(tmp_path / "b", 1.0, 2.0, 11.0)]
+    for steps, later, is_reached in ((2e6, 9.0, False), (2e6, 10.0, True), (3e6, 0.0, True)):
+        goal = Goal(10.0, 2)
+        goal.recall(folders, int(steps))
+        goal.take([{"env_steps": steps}, {"env_steps": steps, "eval/return": later}], is_main=True)
+        assert goal.is_reached == is_reached
+    goal = Goal(None, 2)
+    goal.recall(folders, 3_000_000)
+    assert not goal.is_reached
+
+
+def test_a_comparison_takes_a_run_that_reached_its_goal_as_finished(tmp_path):
+    for name, returns, is_finished in (("reached", (None, 11.0), True), ("running", (None, 9.0), False)):
+        folder = log_of(tmp_path / name, *returns)
+        overrides = [*TINY, "algo=ppo", "total_steps=5_000_000", "stop_at_return=10", f"run_dir={folder.path}"]
+        assert PlannedRun("ppo", (), load_config(overrides)).is_finished == is_finished
 
 
 def test_random_steps_are_those_before_learning_unless_given():
