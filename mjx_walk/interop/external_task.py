@@ -1,6 +1,7 @@
 """An environment of another library as a task that the trainers take."""
 
 import dataclasses
+import numbers
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
@@ -197,7 +198,10 @@ def make_task_class(env: ExternalEnv, name: str, max_episode_steps: int) -> type
     Raises:
         UserError: an invalid time limit.
     """
-    limit = setting(max_episode_steps, at_least=1, at_most=NO_TIME_LIMIT)
+    is_integer = isinstance(max_episode_steps, numbers.Integral) and not isinstance(max_episode_steps, bool)
+    if not is_integer or not 1 <= max_episode_steps <= NO_TIME_LIMIT:
+        raise UserError(f"a time limit of {max_episode_steps} steps: give an integer from 1 to {NO_TIME_LIMIT:,}")
+    limit = setting(int(max_episode_steps), at_least=1, at_most=NO_TIME_LIMIT)
     options = dataclasses.make_dataclass(
         "ExternalOptions", [("max_episode_steps", int, limit)], bases=(TaskOptions,), namespace={"__module__": __name__}
     )

@@ -87,7 +87,8 @@ class _BraxEnvironment:
         self._env = env
         ones = jnp.ones(env.action_size, jnp.float32)
         self.action_low, self.action_high = -ones, ones
-        self.dt = float(getattr(env, "dt", math.inf))
+        repeats = math.prod(one.action_repeat for one in _layers(env) if isinstance(one, EpisodeWrapper))
+        self.dt = float(getattr(env, "dt", math.inf)) * repeats
         with standard_dtypes():
             start = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((2,), jnp.uint32))
         _refuse_warp(start)

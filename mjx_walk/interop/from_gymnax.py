@@ -29,8 +29,8 @@ def from_gymnax(env: Any, params: Any = None, name: str | None = None) -> type[E
     follow from the key of the reset. Episodes that share a start (metric `resets/reuse_rate`) share them.
 
     Args:
-        env: with gymnax's `reset_env` and `step_env`, not in a wrapper. It is one environment. gymnax 1.0 and older
-            versions work.
+        env: with gymnax's `reset_env` and `step_env`, not in a wrapper. It is one environment. gymnax 0.0.8 to 1.0.1
+            work.
         params: its parameters. Default: `env.default_params`.
         name: of the class, such as `Pendulum`, which is registered as `pendulum`. Default: `Gymnax` and the
             environment's name.

@@ -15,7 +15,6 @@ from brax.envs.fast import Fast, ObservationMode
 from brax.envs.wrappers import training
 from helpers import (
     OPTIMIZED,
-    slow_except,
     unregistered,
 )
 from mujoco import mjx
@@ -80,6 +79,7 @@ LIMITED = {
     "by a setting": lambda: make(Timed(), max_episode_steps=4),
     "by Brax": lambda: make(training.EpisodeWrapper(Timed(), 4, 1)),
 }
+LONG = (pytest.mark.slow, pytest.mark.long)
 limited = pytest.mark.parametrize("how", LIMITED)
 
 
@@ -110,7 +110,7 @@ def test_brax_repeats_actions_within_its_time_limit():
     assert set(np.asarray(lengths)) == {2, 4}
 
 
-@pytest.mark.parametrize("how", slow_except(["by Brax"], LIMITED))
+@pytest.mark.parametrize("how", ["by Brax", *(pytest.param(how, marks=LONG) for how in LIMITED if how != "by Brax")])
 def test_values_after_the_time_limit_count_and_after_a_termination_do_not(how):
     """With a discount of 0.5, an endless reward of 1 has the value 2, and that of at most three steps at most 1.75."""
     config_class = ALGORITHMS["ppo"][1]
@@ -233,6 +233,7 @@ class Bare:
         (lambda: training.wrap(Fast()), {}, "in a AutoResetWrapper, but the trainer itself batches and resets"),
         (lambda: training.VmapWrapper(Fast()), {}, "in a VmapWrapper, but"),
         (lambda: training.EpisodeWrapper(Fast(), 9, 1), {"episode_length": 5}, "episode_length=5: the EpisodeWrapper"),
+        *((Fast, {"episode_length": n}, f"a time limit of {n} steps: give an integer from 1") for n in (0, 2.5, True)),
         (lambda: Fast, {}, "Fast has not the reset, step and action_size of a Brax environment"),
         (Bare, {}, "Bare has not the reset, step"),
         (lambda: Fast(obs_mode=ObservationMode.DICT_PIXELS), {}, "none is 'state', which the policy would see"),
@@ -247,3 +248,4 @@ def test_other_objects_are_refused(make_env, keywords, message):
 def test_steps_last_as_long_as_those_of_the_environment():
     clocked = type("Clocked", (Timed,), {"dt": 0.02})
     assert make(clocked()).dt == 0.02 and make(Timed()).dt == math.inf
+    assert make(training.EpisodeWrapper(clocked(), 8, 4)).dt == 0.08
