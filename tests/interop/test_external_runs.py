@@ -16,7 +16,6 @@ from helpers import (
     command,
     command_here,
     leaves,
-    slow_except,
     small_settings,
     unregistered,
     used_settings,
@@ -26,6 +25,9 @@ import mjx_walk
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.utils.errors import UserError
 
+SLOW, LONG = pytest.mark.slow, (pytest.mark.slow, pytest.mark.long)
+OTHERS = [pytest.param(algo, marks=LONG) for algo in ALGORITHMS if algo not in ("ppo", "csac")]
+"""Algorithms whose resumes `training/test_resume.py` covers, on tasks of this package."""
 SETTINGS = ("num_envs=8", "evaluation.num_envs=2", "evaluation.gymnasium_episodes=0", "checkpoint.every_calls=2")
 FILE = """
 import mjx_walk
@@ -51,7 +53,7 @@ def small(algo):
 
 
 @pytest.mark.filterwarnings("ignore:.*changes the run's length")
-@pytest.mark.parametrize("algo", slow_except(["ppo"], ALGORITHMS))
+@pytest.mark.parametrize("algo", ["ppo", pytest.param("csac", marks=SLOW), *OTHERS])
 def test_a_resumed_training_equals_one_that_never_stopped(algo, tmp_path):
     task = mjx_walk.from_brax(Fast(), episode_length=20)
     with unregistered():
@@ -109,20 +111,26 @@ def test_commands_take_the_task_from_a_file(trained, tmp_path, capsys, monkeypat
 
 
 @pytest.mark.slow
-def test_a_training_by_command_is_resumed_and_scored_without_its_file(tmp_path):
+def test_a_training_by_command_is_resumed_and_scored_without_its_file(tmp_path, monkeypatch, capsys):
+    """The resume is in a process of its own."""
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "my_task.py").write_text(FILE)
-    named = ("env.task=my_task.py:Task", "total_steps=64", "run_dir=run")
-    for arguments in (("train", *small("csac"), *named), ("train", "run_dir=run", "resume=true", "total_steps=128")):
-        done = command(*arguments, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-        assert "To load the best policy: mjx_walk.load_run('run', task=…)" in done.stdout + done.stderr
-    done = command("eval", "run=run", "episodes=2", cwd=tmp_path)
-    assert "brax_fast on brax" in done.stdout, done.stderr
+    end = "To load the best policy: mjx_walk.load_run('run', task=…)"
+    with unregistered():
+        named = ("env.task=my_task.py:Task", "total_steps=64", "run_dir=run")
+        assert command_here("train", *small("a2c"), *named) == 0
+        assert end in "".join(capsys.readouterr())
+    done = command("train", "run_dir=run", "resume=true", "total_steps=128", cwd=tmp_path)
+    assert done.returncode == 0 and end in done.stdout + done.stderr, done.stderr
+    with unregistered():
+        assert command_here("eval", "run=run", "episodes=2") == 0
+        assert "brax_fast on brax" in capsys.readouterr().out
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_ppo_learns_to_balance_braxs_pole(tmp_path):
-    """The program of the documentation."""
+    """The program of the documentation. CI traces it, and trains on an environment of gymnax."""
     (example,) = [block for block in blocks("python") if block.startswith("# brax_pendulum.py")]
     program = [sys.executable, "-c", example]
     done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, env=ENVIRONMENT, check=True)

@@ -91,7 +91,7 @@ def test_one_environment_and_nested_batches_agree(make_key):
     np.testing.assert_array_equal(one[0], fresh)
 
 
-@pytest.mark.parametrize("physics", ["jax", "warp"])
+@pytest.mark.parametrize("physics", [pytest.param("jax", marks=pytest.mark.long), "warp"])
 @pytest.mark.slow
 def test_other_engines(physics):
     env = GymnaxEnv("inverted_pendulum", physics, max_episode_steps=5)

@@ -28,7 +28,7 @@ def test_its_checker_accepts_every_task(name):
     checker.check_env(gymnasium.make(f"mjx_walk/{name}", physics="c"))
 
 
-@pytest.mark.parametrize("workers", ["DummyVecEnv", "SubprocVecEnv"])
+@pytest.mark.parametrize("workers", [pytest.param("DummyVecEnv", marks=pytest.mark.long), "SubprocVecEnv"])
 def test_models_work_in_both_environments(workers, tmp_path):
     """Trained here and continued in Gymnasium's environment, and the other way round."""
     make_vec_env = stable_baselines3.common.env_util.make_vec_env
@@ -47,6 +47,7 @@ def test_an_id_suffices():
     stable_baselines3.PPO("MlpPolicy", "mjx_walk/Walker2d-v5", n_steps=32, batch_size=32, device="cpu").learn(32)
 
 
+@pytest.mark.long
 def test_ppo_learns_to_balance():
     """With its defaults, on Gymnasium's own task, too."""
     evaluate_policy = stable_baselines3.common.evaluation.evaluate_policy

@@ -3,14 +3,22 @@
 import importlib.util
 import json
 
+import jax
 import numpy as np
 import pytest
-from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command_here, train_here
+from helpers import command_here
 from safetensors import safe_open
 
 import mjx_walk
 from mjx_walk import zoo
+from mjx_walk.algos import make_algorithm
+from mjx_walk.evaluation.saved_policies import make_task
 from mjx_walk.interop.torch_policy import MODULE, WEIGHTS, write_policy
+from mjx_walk.settings.config import load_config
+from mjx_walk.settings.saved_config import save_config
+from mjx_walk.storage import checkpoint
+from mjx_walk.storage.run_folder import RunFolder
+from mjx_walk.storage.scores import BEST
 from mjx_walk.utils.errors import UserError
 
 needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="pip install torch")
@@ -51,9 +59,16 @@ def test_modules_act_as_policies_of_the_zoo(name, tmp_path, monkeypatch, capsys)
     ],
 )
 def test_modules_act_as_other_networks(settings, tmp_path):
-    tiny = TINY_OFF_POLICY if "algo=td3" in settings else TINY[1:]
-    train_here(tmp_path / "run", "env=hopper", *settings, f"total_steps={TINY_CALL}", tiny=tiny)
-    run = mjx_walk.load_run(tmp_path / "run", physics="c")
+    """Networks and normalizers with random numbers."""
+    config = load_config(["env=hopper", "physics=c", *settings])
+    algorithm = make_algorithm(make_task(config), config.num_envs, config.evaluation, config.algo)
+    shapes, rng = jax.eval_shape(algorithm.policy_params, algorithm.state_shapes()), np.random.default_rng(0)
+    params = jax.tree.map(lambda leaf: np.asarray(rng.uniform(0.1, 0.5, leaf.shape), leaf.dtype), shapes)
+    folder = RunFolder(tmp_path / "run")
+    folder.path.mkdir()
+    save_config(config, folder.config)
+    checkpoint.save(folder.policy(BEST), params, {"env_steps": 0})
+    run = mjx_walk.load_run(folder.path, physics="c")
     write_policy(tmp_path, run, {})
     assert_equal_actions(run, tmp_path)
 
