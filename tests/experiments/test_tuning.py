@@ -236,10 +236,10 @@ def wait_for_metrics(run):
 
 
 @pytest.mark.slow
-def test_a_study_of_four_short_trials(tmp_path, monkeypatch, capfd, optuna):
+def test_a_study_of_ten_short_trials(tmp_path, monkeypatch, capfd, optuna):
     """It is stopped, killed and resumed, prunes trials, survives failures, and gives a recipe that trains."""
-    arguments = [*SHORT, "total_steps=5120", "out=out", "pruner=halving", "per_device=2", "trials=4"]
-    runs = [tmp_path / "out" / f"trial_{number:04d}" / "seed_0" for number in range(4)]
+    arguments = [*SHORT, "total_steps=5120", "out=out", "pruner=halving", "per_device=2", "trials=10"]
+    runs = [tmp_path / "out" / f"trial_{number:04d}" / "seed_0" for number in range(10)]
     for sent, code in ((signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)):
         process = start("tune", *arguments, cwd=tmp_path)
         wait_for_metrics(runs[0])
@@ -250,7 +250,7 @@ def test_a_study_of_four_short_trials(tmp_path, monkeypatch, capfd, optuna):
     assert done.returncode == 0, done.stdout + done.stderr
     trials = trials_of(tmp_path / "out")
     ended = {trial.number: (trial.state.name, trial.params.get("algo.learning_rate")) for trial in trials}
-    assert len(ended) == 4 and {state for state, _ in ended.values()} == {"COMPLETE", "PRUNED", "FAIL"}, done.stdout
+    assert len(ended) == 10 and {state for state, _ in ended.values()} == {"COMPLETE", "PRUNED", "FAIL"}, done.stdout
     for number, (state, rate) in ended.items():
         assert (state == "FAIL") == (rate == 1e30), done.stdout
         steps = [json.loads(line)["env_steps"] for line in (runs[number] / "metrics.jsonl").read_text().splitlines()]
@@ -264,7 +264,7 @@ def test_a_study_of_four_short_trials(tmp_path, monkeypatch, capfd, optuna):
     assert yaml.safe_load(Path("out/best.yaml").read_text())["algo"]["learning_rate"] == best["algo.learning_rate"]
     assert command_here("train", "recipe=out/best.yaml", "total_steps=1", "evaluation.gymnasium_episodes=0") == 0
     assert command_here("tune", *arguments) == 0
-    assert "A study of 4 trials in out, of which 4 ended before" in capfd.readouterr().out
+    assert "A study of 10 trials in out, of which 10 ended before" in capfd.readouterr().out
 
 
 @pytest.mark.slow
