@@ -255,7 +255,14 @@ def test_every_command(line, small_run, tmp_path, monkeypatch, capfd):
     elif name == "compare" and "draw=true" in arguments:
         arguments = ["draw=true", f"out={small_run.parent}"]
     elif name == "train" and not {"--cfg", "--help"} & {*arguments}:
-        arguments += [*sizes(arguments), "total_steps=1", "evaluation.gymnasium_episodes=1"]
+        short = ["total_steps=1", "evaluation.gymnasium_episodes=1"]
+        if "init_from=runs/walk" in arguments:
+            source = [*arguments[:2], "run_dir=runs/walk"]
+            assert command_here(name, *source, *sizes(source), *short) == 0
+        if "init_from=zoo:walker2d-csac" in arguments:  # of the recipe for a GPU
+            arguments += ["hardware=gpu", *(one for one in sizes(arguments) if "hidden_layer_sizes" not in one), *short]
+        else:
+            arguments += [*sizes(arguments), *short]
     elif "robustness=true" in arguments:
         arguments += ["episodes=1"]
     elif "format=minari" in arguments:
