@@ -66,7 +66,7 @@ def write_report(folder: Path) -> Path:
             draw_task(groups, folder / "comparison.png")
             tables, notes = [_summaries(groups)], [_LEGEND]
         budgets = [
-            {**task_cells[task], "variant": name, **at_budgets(same)}
+            task_cells[task] | {"variant": name} | at_budgets(same)
             for task, groups in tasks.items()
             for name, same in groups.items()
         ]
