@@ -207,7 +207,8 @@ def train(
 
 def _make_algorithm(config: Config, task: BaseTask, processes: Processes) -> Algorithm:
     """The algorithm of a run on this process's device."""
-    evaluation, algo = (per_device(own, processes.process_count) for own in (config.evaluation, config.algo))
+    evaluation = per_device(config.evaluation, processes.process_count)
+    algo = per_device(config.algo, processes.process_count)
     if config.init_from and isinstance(algo, OffPolicyConfig) and algo.random_steps is None:
         algo = dataclasses.replace(algo, random_steps=0)  # its policy acts from the start
     return make_algorithm(task, config.num_envs, evaluation, algo, processes.axis_name)

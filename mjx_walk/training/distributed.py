@@ -10,7 +10,7 @@ import functools
 import itertools
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,10 +19,11 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint import multihost
 
-from mjx_walk.algos import Algorithm, TrainState
+from mjx_walk.algos import Algorithm, AlgorithmConfig, TrainState
 from mjx_walk.utils import collectives
 from mjx_walk.utils.collectives import DEVICES
-from mjx_walk.utils.types import Metric, Metrics, Reduction, map_leaves_with
+from mjx_walk.utils.setting_fields import Dataclass
+from mjx_walk.utils.types import Metric, Metrics, PyTree, Reduction, map_leaves_with
 
 __all__ = ["DevicesStep", "Processes", "in_place", "init_on_device", "join_processes", "per_device"]
 
@@ -30,6 +31,12 @@ _PATH_BYTES = 4096
 _TIMEOUT = 3600
 """Seconds that processes wait for each other. One of them may read or write a large replay buffer."""
 _barriers = itertools.count()
+
+_StateT = TypeVar("_StateT", bound=TrainState)
+_BatchT = TypeVar("_BatchT")
+_ConfigT = TypeVar("_ConfigT", bound=AlgorithmConfig)
+_Settings = TypeVar("_Settings", bound=Dataclass)
+_Tree = TypeVar("_Tree")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +92,7 @@ def join_processes() -> Processes:
     return Processes(jax.process_index(), jax.process_count())
 
 
-def per_device(config: Any, process_count: int) -> Any:
+def per_device(config: _Settings, process_count: int) -> _Settings:
     """Settings of an algorithm or of the evaluation for one of several devices, which counts only its own steps."""
     if process_count == 1:
         return config
@@ -129,7 +136,7 @@ class DevicesStep:
         )
         self._compiled: jax.stages.Compiled | None = None
         self._row_shapes: Metrics = {}
-        self._batch: Any = None
+        self._batch: PyTree = None
         """The last batch, in whose memory the next one is collected."""
 
     def __call__(self, state: TrainState) -> tuple[TrainState, Metrics]:
@@ -142,7 +149,7 @@ class DevicesStep:
             state, rows = self._learn_from(state, self._batch, rows, index)
         return state, rows
 
-    def _learn_from(self, state: TrainState, batch: Any, rows: Metrics, index: int) -> tuple[TrainState, Metrics]:
+    def _learn_from(self, state: TrainState, batch: PyTree, rows: Metrics, index: int) -> tuple[TrainState, Metrics]:
         """Learn from the batches of all devices, and write the metrics at an index of the rows."""
         shared = jax.tree.map(self._share, (state, batch))
         if not self._row_shapes:
@@ -161,19 +168,23 @@ class DevicesStep:
         return jax.make_array_from_single_device_arrays(shape, self._sharding, [x])
 
 
-def _collect(algorithm: Algorithm, state: TrainState) -> tuple[TrainState, Any]:
+def _collect(algorithm: Algorithm[_StateT, _BatchT, _ConfigT], state: _StateT) -> tuple[_StateT, _BatchT]:
     return _expand(algorithm.collect(_squeeze(state)))
 
 
-def _learn(algorithm: Algorithm, state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
+def _learn(algorithm: Algorithm[_StateT, _BatchT, _ConfigT], state: _StateT, batch: _BatchT) -> tuple[_StateT, Metrics]:
     """Learn on one device, with metrics over all of them."""
     state, metrics = algorithm.learn(_squeeze(state), _squeeze(batch))
     return _expand((state, {name: _over_devices(metric) for name, metric in metrics.items()}))
 
 
 def _learn_and_log(
-    learn: Callable, state: TrainState, batch: Any, rows: Metrics, index: jax.Array
-) -> tuple[TrainState, Metrics]:
+    learn: Callable[[_StateT, _BatchT], tuple[_StateT, Metrics]],
+    state: _StateT,
+    batch: _BatchT,
+    rows: Metrics,
+    index: jax.Array,
+) -> tuple[_StateT, Metrics]:
     state, metrics = learn(state, batch)
     return state, jax.tree.map(lambda row, x: row.at[:, index].set(x), rows, metrics)
 
@@ -189,7 +200,9 @@ def _over_all_devices(function: Callable, sharding: NamedSharding) -> Callable:
     )
 
 
-def in_place(collect: Callable[[Any], tuple[Any, Any]]) -> Callable[[Any, Any], tuple[Any, Any]]:
+def in_place(
+    collect: Callable[[_StateT], tuple[_StateT, _BatchT]],
+) -> Callable[[_StateT, _BatchT], tuple[_StateT, _BatchT]]:
     """Compile `state → (state, batch)` as `(state, former batch) → (state, batch)`, in the memory of its arguments.
 
     With new memory, XLA may move arrays that physics reads. Warp records its kernels again when an array moves.
@@ -206,9 +219,9 @@ def _over_devices(metric: Metric) -> Metric:
     return metric.replace(value=collectives.mean(metric.value, DEVICES))
 
 
-def _squeeze(tree: Any) -> Any:
+def _squeeze(tree: _Tree) -> _Tree:
     return jax.tree.map(lambda x: x[0], tree)
 
 
-def _expand(tree: Any) -> Any:
+def _expand(tree: _Tree) -> _Tree:
     return jax.tree.map(lambda x: jnp.asarray(x)[None], tree)

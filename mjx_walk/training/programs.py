@@ -6,7 +6,7 @@ The trainer calls their methods and does not know which of them it runs.
 import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,8 @@ __all__ = [
     "make_program",
     "make_step",
 ]
+
+_Tree = TypeVar("_Tree")
 
 _is_finite = jax.jit(is_finite)
 _are_finite = jax.jit(jax.vmap(is_finite))
@@ -55,7 +57,7 @@ class Program(Protocol):
         """
         ...
 
-    def split(self, tree: Any) -> list[Any]:
+    def split(self, tree: _Tree) -> list[_Tree]:
         """Split a state, or a pytree from it, into one tree for each run. With an axis of runs, on the host."""
         ...
 
@@ -100,7 +102,7 @@ class SingleProgram:
     def lower(self, keys: list[jax.Array], restored: TrainState | None) -> list[jax.stages.Lowered]:
         return _lower(self._init, self._step, keys[0], restored)
 
-    def split(self, tree: Any) -> list[Any]:
+    def split(self, tree: _Tree) -> list[_Tree]:
         return [tree]
 
     def merge(self, states: list[TrainState]) -> TrainState:
@@ -128,7 +130,7 @@ class SeedsProgram:
     def lower(self, keys: list[jax.Array], restored: TrainState | None) -> list[jax.stages.Lowered]:
         return _lower(self._init, self._step, jnp.stack(keys), restored)
 
-    def split(self, tree: Any) -> list[Any]:
+    def split(self, tree: _Tree) -> list[_Tree]:
         return _unstack(tree)
 
     def merge(self, states: list[TrainState]) -> TrainState:
@@ -156,7 +158,7 @@ class DevicesProgram:
         # The step needs arrays over all devices.
         return [self._init.lower(keys[0])] if restored is None else []
 
-    def split(self, tree: Any) -> list[Any]:
+    def split(self, tree: _Tree) -> list[_Tree]:
         return _unstack(tree)
 
     def merge(self, states: list[TrainState]) -> TrainState:
@@ -166,13 +168,13 @@ class DevicesProgram:
         return np.asarray(_are_finite(state))
 
 
-def _unstack(tree: Any, axis: int = 0) -> list[Any]:
+def _unstack(tree: _Tree, axis: int = 0) -> list[_Tree]:
     """The trees along an axis of runs, on the host."""
     tree = jax.tree.map(lambda x: np.moveaxis(x, axis, 0), jax.device_get(tree))
     return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(len(jax.tree.leaves(tree)[0]))]
 
 
-def _stack(trees: list[Any]) -> Any:
+def _stack(trees: list[_Tree]) -> _Tree:
     """The inverse of `_unstack`. It stacks on the host, which has room for all of them twice."""
     return jax.tree.map(lambda *xs: jnp.asarray(np.stack(xs)), *map(jax.device_get, trees))
 
