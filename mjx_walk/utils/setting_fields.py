@@ -30,6 +30,7 @@ __all__ = [
 ]
 
 Schema = TypeVar("Schema")
+_Value = TypeVar("_Value")
 
 MAX_SEED = 2**32 - 1
 """Largest seed. JAX's random keys hold 32 bits of it, so larger seeds would repeat smaller ones."""
@@ -55,16 +56,16 @@ class AnyBut(NamedTuple):
 
 
 def setting(
-    default: Any,
+    default: _Value,
     *,
     above: float | None = None,
     at_least: float | None = None,
     at_most: float | None = None,
     below: float | None = None,
     choices: tuple[str, ...] | None = None,
-    only_if: dict[str, Any] | None = None,
+    only_if: Mapping[str, object] | None = None,
     search: str | tuple[float, ...] | None = None,
-) -> Any:
+) -> _Value:
     """A dataclass field with a default, a valid range and a condition.
 
     Args:
