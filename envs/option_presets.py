@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from mjx_walk.utils.errors import UserError
 from mjx_walk.utils.near_misses import unknown
@@ -29,7 +29,7 @@ def preset(key: str, name: str, presets: Mapping[str, _Options]) -> _Options:
     return dataclasses.replace(presets[name])
 
 
-def changes(options: Dataclass) -> dict[str, Any]:
+def changes(options: Dataclass) -> dict[str, object]:
     """The options that differ from their defaults."""
     defaults = vars(type(options)())
     return {name: value for name, value in vars(options).items() if value != defaults[name]}

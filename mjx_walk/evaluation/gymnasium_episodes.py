@@ -7,7 +7,6 @@ import os
 import pickle
 from subprocess import PIPE, Popen
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -115,7 +114,7 @@ def _send(worker: Popen, message: object) -> None:
     send(worker.stdin, message)
 
 
-def _receive(worker: Popen) -> Any:
+def _receive(worker: Popen) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     assert worker.stdout
     try:
         return pickle.load(worker.stdout)

@@ -10,9 +10,11 @@ import os
 import pickle
 import sys
 import warnings
-from typing import IO, Any
+from collections.abc import Mapping, Sequence
+from typing import IO
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_walk.machine.streams import open_standard_streams
 
@@ -59,7 +61,7 @@ def serve() -> None:
         send(answers, (obs, rewards, terminated, truncated, _stacked(infos) if with_infos else {}))
 
 
-def _stacked(infos: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+def _stacked(infos: Sequence[Mapping[str, ArrayLike]]) -> dict[str, np.ndarray]:
     """The entries of all environments' `info`, which hold numbers: `[N, …] f64` by name."""
     return {name: np.array([info[name] for info in infos], np.float64) for name in infos[0]}
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import numbers
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -178,7 +178,7 @@ class ExternalTask(BaseTask):
         return jax.tree.unflatten(self._layout, [memory[name] for name in self._leaves])
 
 
-def _described(leaf: Any) -> str:
+def _described(leaf: Array | jax.ShapeDtypeStruct | None) -> str:
     return "missing" if leaf is None else f"{leaf.dtype}{list(leaf.shape)}"
 
 

@@ -16,6 +16,7 @@ from mujoco import mjx
 from mjx_walk.interop.external_task import ExternalTask, Moment, make_task_class
 from mjx_walk.machine.compat import prepare_jax, standard_dtypes
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.types import PyTree
 
 __all__ = ["from_brax"]
 
@@ -99,7 +100,7 @@ class _BraxEnvironment:
     def reset(self, key: PRNGKeyArray) -> Moment:
         return self._moment(self._env.reset(key))
 
-    def step(self, inner: Any, action: Float[Array, " action_size"]) -> Moment:
+    def step(self, inner: PyTree, action: Float[Array, " action_size"]) -> Moment:
         return self._moment(self._env.step(inner, action))
 
     def _moment(self, state: Any) -> Moment:
@@ -114,7 +115,7 @@ class _BraxEnvironment:
         )
 
 
-def _refuse_warp(state: Any) -> None:
+def _refuse_warp(state: PyTree) -> None:
     """Refuse a state of MJX-Warp. Its contacts are in one array for all environments, so none can be reset alone.
 
     Raises:
@@ -133,7 +134,7 @@ def _term(name: str) -> str:
     return name.replace("/", "_")
 
 
-def _observation_key(obs: Any) -> str | None:
+def _observation_key(obs: Array | Mapping[str, Array]) -> str | None:
     """The entry of several observations that the policy sees; None for a single one.
 
     Raises:

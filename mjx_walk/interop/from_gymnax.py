@@ -15,6 +15,7 @@ from mjx_walk.envs import NO_TIME_LIMIT
 from mjx_walk.interop.external_task import ExternalTask, Moment, make_task_class
 from mjx_walk.machine.compat import prepare_jax
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.types import PyTree
 
 __all__ = ["from_gymnax"]
 
@@ -81,7 +82,7 @@ class _GymnaxEnvironment:
         no = jnp.zeros((), bool)
         return Moment((key, state), obs, jnp.zeros(()), no, no, {})
 
-    def step(self, inner: Any, action: Float[Array, " action_size"]) -> Moment:
+    def step(self, inner: tuple[PRNGKeyArray, PyTree], action: Float[Array, " action_size"]) -> Moment:
         key, step_key = jax.random.split(inner[0])
         action = jnp.reshape(action, self._action_shape)
         obs, state, reward, done, _ = self._env.step_env(step_key, inner[1], action, self._params)

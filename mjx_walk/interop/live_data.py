@@ -2,13 +2,14 @@
 
 import copy
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsIndex
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from mjx_walk.envs import Task
 from mjx_walk.envs.physics import PhysicsState
@@ -105,7 +106,9 @@ class LiveData(mujoco.MjData):
     def __deepcopy__(self, memo: dict[int, object]) -> mujoco.MjData:
         return self.__copy__()
 
-    def __reduce_ex__(self, protocol: Any) -> Any:
+    def __reduce_ex__(
+        self, protocol: SupportsIndex
+    ) -> tuple[Callable[[mujoco.MjData], mujoco.MjData], tuple[mujoco.MjData]]:
         return copy.copy, (self.__copy__(),)
 
     def _refresh(self) -> None:
@@ -189,7 +192,7 @@ def _step(task: Task, model: mujoco.MjModel, data: mujoco.MjData, start: Start, 
     mujoco.mj_rnePostConstraint(model, data)
 
 
-def _write_inputs(model: mujoco.MjModel, data: mujoco.MjData, **values: Any) -> None:
+def _write_inputs(model: mujoco.MjModel, data: mujoco.MjData, **values: ArrayLike | None) -> None:
     """Write inputs by their names. It works for read-only arrays, too. None leaves an input unchanged."""
     for name, value in values.items():
         if value is not None:

@@ -194,7 +194,7 @@ class MujocoAttributes:
         self._show_state()
         return self._gymnasium_env.mujoco_renderer
 
-    def render(self) -> Any:
+    def render(self) -> np.ndarray | tuple[np.ndarray, np.ndarray] | None:
         """A frame in the environment's `render_mode`, as Gymnasium gives it: `[height, width, 3] u8` for `rgb_array`.
 
         It shows the positions after the step. Gymnasium's shows those of the last forward pass, a physics step earlier

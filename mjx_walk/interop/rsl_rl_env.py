@@ -1,7 +1,5 @@
 """Many environments as a `VecEnv` of rsl_rl."""
 
-from typing import Any
-
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
@@ -45,7 +43,7 @@ class RslRlEnv(VecEnv):
         """Current observations, `[B, observation_size] f32`."""
         return self._obs
 
-    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
         """Step all environments, and reset those whose episode ends.
 
         Args:

@@ -1,7 +1,7 @@
 """Many environments in one program as a `VecEnv` of Stable-Baselines3."""
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import jax
@@ -73,7 +73,7 @@ class SB3Env(VecEnv):
         value = None if attr_name == "render_mode" else getattr(self._batch.task, attr_name)
         return [value for _ in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: int | Iterable[int] | None = None) -> NoReturn:
         """
         Raises:
             UserError: always, since all environments are one program.
@@ -81,8 +81,12 @@ class SB3Env(VecEnv):
         raise UserError(f"'{attr_name}' cannot be set: all environments are one program; give options to make_sb3_env")
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
-    ) -> list[Any]:
+        self,
+        method_name: str,
+        *method_args: object,
+        indices: int | Iterable[int] | None = None,
+        **method_kwargs: object,
+    ) -> NoReturn:
         """
         Raises:
             UserError: always, since all environments are one program.

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.evaluation.saved_policies import SavedPolicy
 from mjx_walk.storage.files import replacing
 from mjx_walk.utils.errors import UserError
+from mjx_walk.utils.types import Params, PyTree
 
 __all__ = ["MODULE", "WEIGHTS", "write_policy"]
 
@@ -41,6 +42,19 @@ _TOLERANCE = 1e-4
 """Largest difference of an action, as a share of its range, between the exported arrays and the policy."""
 
 
+class _Facts(TypedDict):
+    """What builds the network around the arrays, stored as JSON."""
+
+    sizes: list[int]
+    """Sizes of the observation, the hidden layers and the action."""
+    activation: str
+    """PyTorch's name."""
+    layer_norm: bool
+    squashed: bool
+    """Whether tanh bounds the action. Otherwise it is clipped."""
+    observation_clip: float
+
+
 def write_policy(folder: Path, run: SavedPolicy, metadata: Mapping[str, str]) -> None:
     """Write the files of a policy into an existing folder.
 
@@ -56,8 +70,7 @@ def write_policy(folder: Path, run: SavedPolicy, metadata: Mapping[str, str]) ->
         new.write_bytes(module.read_bytes())
 
 
-def _facts(run: SavedPolicy) -> dict[str, Any]:
-    """What builds the network around the arrays, as for JSON."""
+def _facts(run: SavedPolicy) -> _Facts:
     algo: Any = run.config.algo
     if algo.activation not in _ACTIVATIONS:
         raise UserError(f"PyTorch has no activation '{algo.activation}' of this policy; use format=onnx")
@@ -95,13 +108,13 @@ def _arrays(run: SavedPolicy) -> dict[str, np.ndarray]:
     return {name: np.ascontiguousarray(array, np.float32) for name, array in found.items()}
 
 
-def _numbered(params: Mapping[str, Any], prefix: str) -> list[Any]:
+def _numbered(params: Params, prefix: str) -> list[PyTree]:
     """Parameters whose names are a prefix and a number, in order."""
     numbers = sorted(int(name.removeprefix(prefix)) for name in params if name.startswith(prefix))
     return [params[f"{prefix}{number}"] for number in numbers]
 
 
-def _check(run: SavedPolicy, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
+def _check(run: SavedPolicy, arrays: Mapping[str, np.ndarray], facts: _Facts) -> None:
     """Compare the arrays with the policy on random observations.
 
     Raises:

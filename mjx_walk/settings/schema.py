@@ -115,7 +115,7 @@ def text_keys(env: str, algo: str) -> set[str]:
 
 def _walk(
     schema: Dataclass | type[Dataclass], prefix: str, groups: Mapping[str, type]
-) -> Iterator[tuple[str, object, Mapping[str, Any]]]:
+) -> Iterator[tuple[str, object, Mapping[str, object]]]:
     """The full key, the annotation and the limits of every setting and of every group of settings."""
     hints = typing.get_type_hints(schema)
     for field in dataclasses.fields(schema):

@@ -84,7 +84,7 @@ def read_metadata(path: Path) -> Metadata:
     return cast(Metadata, metadata)
 
 
-def _is_count(value: Any, at_least: int = 0) -> bool:
+def _is_count(value: object, at_least: int = 0) -> bool:
     return type(value) is int and at_least <= value < 2**63
 
 
@@ -92,7 +92,7 @@ def _is_finite(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < _MAX_NUMBER
 
 
-def _are_few_counts(value: Any) -> bool:
+def _are_few_counts(value: object) -> bool:
     return isinstance(value, list) and len(value) <= _MAX_SNAPSHOTS and all(map(_is_count, value))
 
 
