@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from mjx_walk.settings.schema import CheckpointConfig, Config, leaves
 from mjx_walk.storage.files import user_path, working_folder
 from mjx_walk.storage.run_folder import PREFIX
 from mjx_walk.utils.errors import UserError
-from mjx_walk.utils.setting_fields import has_effect, refuse_ineffective, validate
+from mjx_walk.utils.setting_fields import has_effect, in_yaml, refuse_ineffective, validate
 
 __all__ = [
     "CONFIG_DIR",
@@ -128,7 +129,10 @@ def flatten(config: Config) -> dict[str, object]:
 
 
 def training_command(config: Config) -> str:
-    """The shortest training command for a configuration: a recipe, and the settings that differ from it."""
+    """The shortest training command for a configuration: a recipe, and the settings that differ from it.
+
+    A shell and Hydra read the values that they had.
+    """
     given = [f"env={config.env.name}", f"algo={config.algo.name}"]
     usual = f"{config.hardware}/{config.env.name}_{config.algo.name}"
     recipes = [f"recipe={name}" for name in recipe_names() if Path(name).name == Path(usual).name and name != usual]
@@ -137,7 +141,8 @@ def training_command(config: Config) -> str:
     for asked in (given, *([*given, recipe] for recipe in recipes)):
         settings = flatten(load_config([f"hardware={config.hardware}", *asked]))
         relevant = (key for key in sorted(own) if not key.startswith(_IRRELEVANT) and has_effect(config, key))
-        commands.append([*asked, *(f"{key}={own[key]}" for key in relevant if own[key] != settings.get(key))])
+        differing = (key for key in relevant if own[key] != settings.get(key))
+        commands.append([*asked, *(shlex.quote(f"{key}={in_yaml(own[key])}") for key in differing)])
     return " ".join(["python -m mjx_walk.train", *min(commands, key=len)])
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -242,6 +243,19 @@ def test_a_given_setting_without_effect_is_refused_unless_a_run_is_resumed(tmp_p
     save_config(config, tmp_path / "config.yaml")
     for further in ([], [given], ["env=humanoid", "algo=ppo", given, constant]):
         assert resolve([f"run_dir={tmp_path}", "resume=true", *further]).algo.schedule_steps == 7
+
+
+def test_a_shell_and_hydra_read_the_values_of_a_training_command(tmp_path):
+    """Without a value, lists, truth values, and a file whose name has a space."""
+    task = tmp_path / "my task.xml"
+    given = ["env=humanoid", "algo=csac", "hardware=cpu", "algo.target_entropy=0.5", "algo.final_target_entropy=null"]
+    given += ["algo.normalize_rewards=false", "algo.critic_hidden_layer_sizes=[64,32]", f"env.xml_file={task}"]
+    config = load_config(given)
+    config.algo.final_target_entropy, config.algo.noise_repeat = None, None
+    words = shlex.split(training_command(config))
+    assert words[:5] == ["python", "-m", "mjx_walk.train", "env=humanoid", "algo=csac"]
+    assert {f"env.xml_file={task}", "algo.critic_hidden_layer_sizes=[64,32]"} < {*words}
+    assert flatten(load_config(["hardware=cpu", *words[3:]])) == flatten(config)
 
 
 def test_a_job_of_a_sweep_whose_setting_has_no_effect_is_refused(monkeypatch, tmp_path):

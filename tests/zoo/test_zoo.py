@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import shlex
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def test_its_command_gives_its_settings(name):
     config = read_config(folder.config)
     command = read_scores(folder.gymnasium_scores).metadata["command"]
     assert command == training_command(config)
-    words = command.split()
+    words = shlex.split(command)
     assert words[:3] == ["python", "-m", "mjx_walk.train"]
     asked, own = flatten(load_config(["hardware=gpu", *words[3:]])), flatten(config)
     used = [key for key in own if has_effect(config, key)]
