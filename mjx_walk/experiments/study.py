@@ -12,7 +12,7 @@ from mjx_walk.experiments.search_space import SearchSpace
 from mjx_walk.experiments.suggestions import make_pruner, make_sampler, with_values
 from mjx_walk.settings.config import flatten, load_config
 from mjx_walk.settings.recipe_files import recipe_file
-from mjx_walk.settings.saved_config import in_short
+from mjx_walk.settings.saved_config import differing_values, in_short
 from mjx_walk.storage.files import check_replaceable, refuse_links
 from mjx_walk.storage.locks import locked
 from mjx_walk.utils.errors import UserError, first_line
@@ -266,10 +266,6 @@ def _refuse_other(saved: Facts, asked: Facts, folder: Path) -> None:
         {**facts.settings, **{f"search {k}": v for k, v in facts.ranges.items()}, "seeds": facts.seeds}
         for facts in (saved, asked)
     )
-    differing = [
-        f"{key} (was {old.get(key)}, now {new.get(key)})"
-        for key in sorted(old.keys() | new.keys())
-        if old.get(key) != new.get(key)
-    ]
+    differing = differing_values(old, new)
     if differing:
         raise UserError(f"{folder} holds a study with other settings ({in_short(differing)}); choose another out=DIR")

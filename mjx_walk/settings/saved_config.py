@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import operator
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -27,6 +27,7 @@ __all__ = [
     "MAY_DIFFER",
     "as_yaml",
     "differences",
+    "differing_values",
     "in_short",
     "name_same_file",
     "read_algorithm",
@@ -176,7 +177,17 @@ def differences(saved: Config, config: Config, besides: tuple[str, ...] = MAY_DI
         config: the present one.
         besides: keys to ignore.
     """
-    old, new = flatten(saved), flatten(config)
+    return differing_values(flatten(saved), flatten(config), besides)
+
+
+def differing_values(old: Mapping[str, object], new: Mapping[str, object], besides: tuple[str, ...] = ()) -> list[str]:
+    """The keys whose values differ, with both values, for messages. A missing value is None.
+
+    Args:
+        old: former values by their full keys.
+        new: present ones.
+        besides: keys to ignore.
+    """
     return [
         f"{key} (was {old.get(key)}, now {new.get(key)})"
         for key in sorted(old.keys() | new.keys())

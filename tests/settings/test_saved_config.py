@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mjx_walk.settings.config import load_config
-from mjx_walk.settings.saved_config import as_yaml, read_saved_config, save_config
+from mjx_walk.settings.config import flatten, load_config
+from mjx_walk.settings.saved_config import as_yaml, differences, differing_values, read_saved_config, save_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.run_folder import RunFolder, open_existing
 from mjx_walk.utils.errors import UserError
@@ -70,3 +70,14 @@ def test_what_may_change_comes_from_the_file_and_a_length_is_named(folder, train
     save_config(changed, folder.config)
     with pytest.warns(UserWarning, match=r"changes the run's length: total_steps \(was 640, now 1280\)"):
         assert read_saved_config(folder) == changed
+
+
+def test_runs_and_studies_word_their_differences_alike(trained):
+    """A study compares plain values, some of which only one side has."""
+    changed = dataclasses.replace(trained, seed=3, total_steps=1280)
+    assert differences(trained, changed) == ["seed (was 0, now 3)"]
+    old, new = flatten(trained), flatten(changed) | {"search algo.discount": "0.9,0.99"}
+    assert differing_values(old, new, ("total_steps",)) == [
+        "search algo.discount (was None, now 0.9,0.99)",
+        *differences(trained, changed),
+    ]
