@@ -110,7 +110,7 @@ class Locomotion(Task):
     def load_model(self) -> mujoco.MjModel:
         self.robot = load_robot(self.model_file, self.options.motors, self.options.feet)
         if self.ground.is_on:
-            self.robot = with_ground(self.robot, self.ground.added_to(self.robot.spec))
+            self.robot = with_ground(self.robot, self.ground.added_to(self.robot.spec, self.robot.model))
         self._targets = jnp.asarray(self.robot.targets, jnp.float32)
         self._touch_height = _CONTACT * (self.robot.standing[2] - self.robot.floor)
         return self.robot.model

@@ -23,6 +23,7 @@ __all__ = [
     "check_model",
     "check_pose",
     "is_coordinate",
+    "load_compiled_spec",
     "load_model",
     "load_spec",
     "model_file",
@@ -74,6 +75,18 @@ def load_model(xml_file: str) -> mujoco.MjModel:
     Raises:
         UserError: the file does not exist, or MuJoCo cannot read it.
     """
+    return load_compiled_spec(xml_file)[1]
+
+
+def load_compiled_spec(xml_file: str) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """Load a MuJoCo model, and the specification that it is compiled from, to change it.
+
+    Args:
+        xml_file: name of one of Gymnasium's assets, or a path.
+
+    Raises:
+        UserError: the file does not exist, or MuJoCo cannot read it.
+    """
     write_no_log()
     path = Path(os.path.abspath(model_path(xml_file)))
     if not path.is_file():
@@ -82,18 +95,19 @@ def load_model(xml_file: str) -> mujoco.MjModel:
         raise UserError(f"MuJoCo cannot open {path}: it takes the backslash for a separator; choose another path")
     try:
         with hide_deprecations():
-            model = mujoco.MjModel.from_xml_path(str(path))
+            spec = mujoco.MjSpec.from_file(str(path))
+            model = spec.compile()
     except ValueError as error:
         if "(increase <size memory" in str(error):
             raise UserError(f"{path}: {_TOO_LITTLE_MEMORY}") from error
         raise UserError(f"MuJoCo cannot read {path}: {_in_one_line(str(error))}") from error
     if not _has_enough_memory(path, model):
         raise UserError(f"{path}: {_TOO_LITTLE_MEMORY}")
-    return model
+    return spec, model
 
 
 def load_spec(xml_file: str) -> mujoco.MjSpec:
-    """Load a model that `load_model` accepts, to change it."""
+    """Load a model that `load_model` accepts, to change it. It is not compiled."""
     with hide_deprecations():
         return mujoco.MjSpec.from_file(os.path.abspath(model_path(xml_file)))
 

@@ -134,8 +134,8 @@ class Task(BaseTask):
 
     def load_model(self) -> mujoco.MjModel:
         """The model of `model_file` on `ground`. A task may complete it."""
-        model = models.load_model(self.model_file)
-        return self.ground.added_to(models.load_spec(self.model_file)) if self.ground.is_on else model
+        spec, model = models.load_compiled_spec(self.model_file)
+        return self.ground.added_to(spec, model) if self.ground.is_on else model
 
     def num_substeps(self) -> int:
         """Physics steps of one environment step."""

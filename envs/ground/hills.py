@@ -1,6 +1,7 @@
 """Hills of boxes on the floor of a model: their heights, and the places where episodes start."""
 
 import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +73,7 @@ class Hills:
         return jnp.stack([x, y]) if has_y else x[None]
 
 
-def with_hills(spec: mujoco.MjSpec, hills: Hills) -> mujoco.MjModel:
+def with_hills(spec: mujoco.MjSpec, hills: Hills, flat: mujoco.MjModel | None = None) -> mujoco.MjModel:
     """The model with hills on its floor. Contacts with them are as with the floor.
 
     The hills come after all other geoms of the world.
@@ -80,19 +81,21 @@ def with_hills(spec: mujoco.MjSpec, hills: Hills) -> mujoco.MjModel:
     Args:
         spec: the model, which changes.
         hills: the hills.
+        flat: what `spec` was last compiled to, unchanged since. Default: it is compiled here.
 
     Raises:
         UserError: the model has no floor, several floors, or one that is not level.
     """
-    with hide_deprecations():
-        flat = spec.compile()
+    if flat is None:
+        with hide_deprecations():
+            flat = spec.compile()
     floor, height = _floor(spec, flat)
     name = _NAME
     while any(geom.name.startswith(name) for geom in spec.geoms):
         name = f"_{name}"
     pairs = [pair for pair in spec.pairs if floor.name and floor.name in (pair.geomname1, pair.geomname2)]
     for index, section in enumerate(hills.sections):
-        box = _add_box(spec, section, height)
+        box = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, **_box(section, height)._asdict())
         box.name, box.rgba = f"{name}{index}", _COLORS[index % 2]
         for attribute in _SHARED:
             setattr(box, attribute, getattr(floor, attribute))
@@ -105,19 +108,30 @@ def with_hills(spec: mujoco.MjSpec, hills: Hills) -> mujoco.MjModel:
         return spec.compile()
 
 
-def has_hills(model: mujoco.MjModel) -> bool:
-    """Whether `with_hills` has made a model."""
-    return any(_NAME in model.geom(geom).name for geom in np.flatnonzero(model.geom_bodyid == 0))
+def has_hills(model: mujoco.MjModel, hills: Hills) -> bool:
+    """Whether the world of a model has the boxes of the hills, whatever their names and the height of the floor."""
+    is_box = (model.geom_bodyid == 0) & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)
+    found = np.hstack([model.geom_size, model.geom_pos[:, :2], model.geom_quat])[is_box]
+    boxes = [_box(section, 0.0) for section in hills.sections]
+    expected = np.array([[*box.size, *box.pos[:2], *box.quat] for box in boxes])
+    return bool(np.isclose(expected[:, None], found).all(axis=2).any(axis=1).all())
 
 
-def _add_box(spec: mujoco.MjSpec, section: Section, height: float) -> mujoco.MjsGeom:
-    """Add a box whose upper face is a section, on a floor of some height, m."""
+class _Box(NamedTuple):
+    """Size, m, place, m, and orientation of a geom."""
+
+    size: list[float]
+    pos: Float[np.ndarray, "3"]
+    quat: list[float]
+
+
+def _box(section: Section, height: float) -> _Box:
+    """The box whose upper face is a section, on a floor of some height, m."""
     length, climb = section.end - section.start, section.last - section.first
     angle = math.atan2(climb, length)
     middle = np.array([(section.start + section.end) / 2, 0.0, height + (section.first + section.last) / 2])
     below = _THICKNESS / 2 * np.array([math.sin(angle), 0.0, -math.cos(angle)])
-    return spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX,
+    return _Box(
         size=[math.hypot(length, climb) / 2, _WIDTH / 2, _THICKNESS / 2],
         pos=middle + below,
         quat=[math.cos(angle / 2), 0.0, -math.sin(angle / 2), 0.0],

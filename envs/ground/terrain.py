@@ -48,17 +48,18 @@ class Terrain:
         """Whether the ground is not flat."""
         return self._hills is not None
 
-    def added_to(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    def added_to(self, spec: mujoco.MjSpec, flat: mujoco.MjModel | None = None) -> mujoco.MjModel:
         """A model on this ground, which is not flat.
 
         Args:
             spec: the model, which changes.
+            flat: what `spec` was last compiled to, unchanged since. Default: it is compiled here.
 
         Raises:
             UserError: its floor cannot have hills.
         """
         assert self._hills
-        return with_hills(spec, self._hills)
+        return with_hills(spec, self._hills, flat)
 
     def check(self, model: mujoco.MjModel) -> None:
         """Check that a task's model has the hills, and that its first coordinates are the root's place in the world.
@@ -68,7 +69,7 @@ class Terrain:
         """
         if not self._hills:
             return
-        if not has_hills(model):
+        if not has_hills(model, self._hills):
             raise UserError(
                 "env.ground: the model has no hills, because load_model of its task does not add them; return "
                 "self.ground.added_to(spec) there"

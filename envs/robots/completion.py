@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from mjx_walk.envs.models import load_model, load_spec
+from mjx_walk.envs.models import load_compiled_spec, load_spec
 from mjx_walk.envs.motors import joint_of
 from mjx_walk.envs.robots.servos import Gains, Motors, gains, torque_motors
 from mjx_walk.machine.quiet_mujoco import hide_deprecations
@@ -29,7 +29,7 @@ class Completed(NamedTuple):
 
     model: mujoco.MjModel
     spec: mujoco.MjSpec
-    """The same, for further changes."""
+    """What `model` is compiled from, for further changes."""
     floor: float
     """Height of the floor, m."""
 
@@ -46,15 +46,16 @@ def complete(xml_file: str, motors: Motors) -> Completed:
     Raises:
         UserError: the file is missing or invalid, its first joint is not free, or no hinge can be moved.
     """
-    model = load_model(xml_file)
+    spec, model = load_compiled_spec(xml_file)
     _check_root(model, xml_file)
-    spec = load_spec(xml_file)
+    changed = load_spec(xml_file)
     floors = _floors(model)
     if not floors.size:
-        _add_floor(spec)
+        _add_floor(changed)
         _LOGGER.info("%s has no floor: added one at height 0", xml_file)
-    added = _add_servos(spec, model, motors) if not model.nu else _replace_motors(spec, model, motors)
+    added = _add_servos(changed, model, motors) if not model.nu else _replace_motors(changed, model, motors)
     if added or not floors.size:
+        spec = changed
         spec.memory = spec.nstack = spec.njmax = spec.nconmax = -1  # MuJoCo chooses
         with hide_deprecations():
             model = spec.compile()

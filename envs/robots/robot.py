@@ -29,7 +29,7 @@ class Robot:
 
     model: mujoco.MjModel
     spec: mujoco.MjSpec
-    """The model, for further changes."""
+    """What the model without hills is compiled from, for further changes."""
     root: int
     """The body with the free joint."""
     floor: float

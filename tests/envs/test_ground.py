@@ -12,6 +12,7 @@ from mjx_walk.envs import make_env
 from mjx_walk.envs.ground.options import PRESETS, Ground
 from mjx_walk.envs.ground.profile import FOOT, ROW_LENGTH, sections
 from mjx_walk.envs.model_files import model_path
+from mjx_walk.envs.models import load_spec
 from mjx_walk.envs.walker2d import Walker2d, Walker2dOptions
 from mjx_walk.settings.config import load_config
 from mjx_walk.utils.errors import UserError
@@ -182,12 +183,51 @@ class Overriding(Walker2d):
         return mujoco.MjModel.from_xml_path(str(model_path(self.model_file)))
 
 
-def test_an_own_task_whose_model_has_no_hills():
+class Named(Walker2d):
+    """Its model has a box with the name of a hill."""
+
+    def load_model(self):
+        spec = load_spec(self.model_file)
+        spec.worldbody.add_geom(name="hill_0", type=mujoco.mjtGeom.mjGEOM_BOX, size=[1.0, 1.0, 0.1], pos=[9.0, 0, 0])
+        return spec.compile()
+
+
+class Renamed(Walker2d):
+    """It changes the names of its hills."""
+
+    def load_model(self):
+        spec = load_spec(self.model_file)
+        self.ground.added_to(spec)
+        for geom in spec.worldbody.geoms:
+            geom.name = geom.name.replace("hill_", "ramp_")
+        return spec.compile()
+
+
+@pytest.mark.parametrize("task", [Overriding, Named])
+def test_an_own_task_whose_model_has_no_hills(task):
     options = Walker2dOptions(ground=Ground(slope=10.0))
     with pytest.raises(
         UserError, match=r"load_model of its task does not add them; return self.ground.added_to\(spec\)"
     ):
-        Overriding(options, "c")
+        task(options, "c")
+
+
+def test_an_own_task_may_rename_its_hills():
+    model = Renamed(Walker2dOptions(ground=Ground(slope=10.0, rows=2)), "c").model
+    assert model.geom("ramp_5").id > 0 and not any("hill" in model.geom(i).name for i in range(model.ngeom))
+
+
+@pytest.mark.parametrize("name", ["walker2d", "locomotion"])
+def test_a_model_with_hills_is_compiled_twice(name, tmp_path, monkeypatch):
+    """Without the hills, whose place depends on the floor, and with them."""
+    plane = '<geom type="plane" size="9 9 1"/>'
+    robot = small_robot.small_robot(actuator='position ctrlrange="-3 3"', before=plane)
+    path = small_robot.write(tmp_path, robot)
+    compiled, from_spec, from_path = [], mujoco.MjSpec.compile, mujoco.MjModel.from_xml_path
+    monkeypatch.setattr(mujoco.MjSpec, "compile", lambda spec: compiled.append(spec) or from_spec(spec))
+    monkeypatch.setattr(mujoco.MjModel, "from_xml_path", lambda path: compiled.append(path) or from_path(path))
+    make_env(name, "c", ground="steps", xml_file=path if name == "locomotion" else None)
+    assert len(compiled) == 2
 
 
 @pytest.mark.parametrize(
