@@ -2,6 +2,8 @@
 
 import contextlib
 import dataclasses
+import logging
+import threading
 import time
 import typing
 from collections.abc import Iterator
@@ -22,12 +24,17 @@ if TYPE_CHECKING:
 
 __all__ = ["Facts", "StudyFolder", "TakenTrial", "facts_of", "require_optuna"]
 
+_LOGGER = logging.getLogger(__name__)
 _NAME = "mjx_walk"
 """Name of the study, and of the attribute that holds its facts."""
 _CHOOSE_RECIPE = ("hardware", "env", "env.task", "algo", "recipe")
 _OF_A_TRIAL = ("run_dir", "resume", "evaluation.gymnasium_episodes")
 """Settings of trials that no recipe has."""
 _BUSY = "in use"
+_SILENT_SECONDS = 2.0
+"""Wait for the journal's lock without a message. A process holds it for the time of a write."""
+_STALE_SECONDS = 30
+"""Optuna removes a lock that is this old."""
 
 
 def require_optuna() -> None:
@@ -91,6 +98,28 @@ class TakenTrial:
     """Closing it releases the lock."""
 
 
+class _JournalLock:
+    """Optuna's lock of the journal. A wait for it is logged, since a killed process leaves its lock behind."""
+
+    def __init__(self, journal: Path):
+        from optuna.storages.journal import JournalFileOpenLock
+
+        self._file = f"{journal}.lock"
+        self._lock = JournalFileOpenLock(str(journal), _STALE_SECONDS)
+
+    def acquire(self) -> bool:
+        says = "waiting up to %d s for the process that holds %s; if no other one works on this study, delete that file"
+        notice = threading.Timer(_SILENT_SECONDS, _LOGGER.warning, (says, _STALE_SECONDS, self._file))
+        notice.start()
+        try:
+            return self._lock.acquire()
+        finally:
+            notice.cancel()
+
+    def release(self) -> None:
+        self._lock.release()
+
+
 class StudyFolder:
     """The folder of a study, which several processes share."""
 
@@ -146,12 +175,10 @@ class StudyFolder:
 
     def _mend(self) -> None:
         """Remove a last line that a full disk has left incomplete. Optuna would append to it."""
-        from optuna.storages.journal import JournalFileOpenLock
-
         refuse_links(self.storage, self.path)
         if not self.storage.is_file():
             return
-        lock = JournalFileOpenLock(str(self.storage))
+        lock = _JournalLock(self.storage)
         lock.acquire()
         try:
             with self.storage.open("rb+") as file:
@@ -165,13 +192,13 @@ class StudyFolder:
     def _load(self, create: bool) -> "optuna.Study":
         from optuna import create_study, load_study
         from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+        from optuna.storages.journal import JournalFileBackend
 
         refuse_links(self.storage, self.path)
         check_replaceable(self.storage)
-        name = str(self.storage)
+        name, lock = str(self.storage), typing.cast(Any, _JournalLock(self.storage))
         try:
-            storage = JournalStorage(JournalFileBackend(name, JournalFileOpenLock(name)))
+            storage = JournalStorage(JournalFileBackend(name, lock))
             if create:
                 return create_study(storage=storage, study_name=_NAME, direction="maximize", load_if_exists=True)
             return load_study(storage=storage, study_name=_NAME)

@@ -4,6 +4,7 @@ import json
 import re
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -316,6 +317,18 @@ def test_a_line_that_a_full_disk_cut_off_is_removed(tmp_path, optuna):
     assert [trial.state.name for trial in study.trials] == ["COMPLETE", "RUNNING"]
     ended(study, folder.take_trial(study, space, 2, "tpe", "none", 0), 3.0)
     assert [trial.value for trial in folder.open().trials] == [1.0, 3.0]
+
+
+def test_a_wait_for_the_lock_of_a_killed_process_is_logged(tmp_path, monkeypatch, caplog, optuna):
+    """Once, with the file to delete."""
+    monkeypatch.setattr("mjx_walk.experiments.study._SILENT_SECONDS", 0.1)
+    space, folder, _ = new_study(tmp_path, "algo.discount=0.9,0.99")
+    stale = tmp_path / "study.log.lock"
+    stale.touch()
+    threading.Timer(0.3, stale.unlink).start()
+    folder.create_or_open(facts_of(space, [0]))
+    (line,) = [record.getMessage() for record in caplog.records if record.name.startswith("mjx_walk")]
+    assert line.startswith(f"waiting up to 30 s for the process that holds {stale}; ") and "delete that file" in line
 
 
 def test_a_trial_that_was_killed_between_two_values_gets_all(tmp_path, optuna):
