@@ -52,6 +52,8 @@ _LOGGER = logging.getLogger(__name__)
 class Run(SavedPolicy):
     """A run on disk: its configuration, metrics and one of its policies."""
 
+    _NOT_PICKLED = (*SavedPolicy._NOT_PICKLED, "_episodes")
+
     @functools.cached_property
     def metrics(self) -> list[Row]:
         """All rows of `metrics.jsonl`; none for a policy of the zoo, which has no such file.

@@ -19,7 +19,7 @@ from mjx_walk.envs.randomization.options import Randomization
 from mjx_walk.machine.compat import standard_settings
 from mjx_walk.settings.config import Config, training_command
 from mjx_walk.settings.input_files import check_model, warn_of_changed_inputs
-from mjx_walk.settings.saved_config import read_saved_config
+from mjx_walk.settings.saved_config import as_yaml, config_of, read_saved_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.checkpoint_metadata import Metadata
 from mjx_walk.storage.run_folder import RunFolder
@@ -45,6 +45,9 @@ _LOGGER = logging.getLogger(__name__)
 
 class SavedPolicy:
     """A policy of a run folder, and the task that it was trained on."""
+
+    _NOT_PICKLED: tuple[str, ...] = ("task", "algorithm", "act")
+    """Attributes that hold compiled functions or threads, and are built again."""
 
     @standard_settings()
     def __init__(self, folder: RunFolder, physics: str | None = None, policy: str = BEST):
@@ -79,14 +82,19 @@ class SavedPolicy:
         self.algorithm = in_float32(make_algorithm(self.task, config.num_envs, config.evaluation, config.algo))
 
     def __getstate__(self) -> dict[str, object]:
-        """Pickle and copy the parameters, without compiled functions."""
-        kept = {name: value for name, value in vars(self).items() if name not in ("task", "algorithm", "act")}
-        return kept | {"policy_params": jax.device_get(self.policy_params), "_read_files": files_of(self.task)}
+        """Pickle and copy the parameters and the configuration as a text, without compiled functions.
+
+        The classes of the settings of a registered task or algorithm exist in this process only.
+        """
+        kept = {name: value for name, value in vars(self).items() if name not in self._NOT_PICKLED}
+        changed = {"config": as_yaml(self.config), "policy_params": jax.device_get(self.policy_params)}
+        return kept | changed | {"_read_files": files_of(self.task)}
 
     @standard_settings()
     def __setstate__(self, state: dict[str, Any]) -> None:
         read_files: ReadFiles = state.pop("_read_files")
-        vars(self).update(state)
+        config = config_of(state.pop("config"), RunFolder(state["path"]).config)
+        vars(self).update(state, config=config)
         self._build()
         warn_of_changed_files(read_files)
 

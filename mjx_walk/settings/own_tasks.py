@@ -71,8 +71,8 @@ def find_saved_task(name: object, source: str | None, config: Path) -> None:
         return
     if not source:
         raise UserError(
-            f"the task '{name}' of {config} is not registered; add {KEY}=FILE.py:CLASS to the command, or pass "
-            "task=CLASS to run or load_run"
+            f"the task '{name}' of {config} is not registered; add {KEY}=FILE.py:CLASS to the command, pass "
+            "task=CLASS to run or load_run, or call mjx_walk.register_task first"
         )
     require_trusted(source, KEY)
     found = register_task_file(source)

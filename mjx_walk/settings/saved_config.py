@@ -26,6 +26,7 @@ from mjx_walk.utils.setting_fields import Dataclass
 __all__ = [
     "MAY_DIFFER",
     "as_yaml",
+    "config_of",
     "differences",
     "differing_values",
     "in_short",
@@ -55,6 +56,19 @@ _MOST_NAMED = 5
 def as_yaml(config: Config) -> str:
     """A configuration as the text of a `config.yaml`."""
     return OmegaConf.to_yaml(OmegaConf.structured(config))
+
+
+def config_of(text: str, path: Path) -> Config:
+    """The configuration of a text that `as_yaml` wrote.
+
+    Args:
+        text: the content of a `config.yaml`.
+        path: for messages.
+
+    Raises:
+        UserError: its task or its algorithm is not registered, or it names code that the user does not trust.
+    """
+    return _parse(DictConfig(OmegaConf.create(text)), path)
 
 
 def save_config(config: Config, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import pickle
 import re
 import subprocess
 import sys
@@ -83,14 +84,18 @@ def test_a_run_is_loaded_and_scored(trained):
         run = mjx_walk.load_run(trained, task=mjx_walk.from_brax(Fast(), 20))
         scores = run.evaluate(3)
         assert scores.env == "brax_fast on brax" and list(scores.lengths) == [20, 20, 20]
-        assert copy.deepcopy(run).policy(np.zeros(2)) == run.policy(np.zeros(2))
+        pickled = pickle.dumps(run)
+        for other in (copy.deepcopy(run), pickle.loads(pickled)):
+            assert other.policy(np.zeros(2)) == run.policy(np.zeros(2)) and other.config == run.config
         with pytest.raises(UserError, match="brax_fast is simulated by brax: physics=, films, play and export are for"):
             mjx_walk.load_run(trained, physics="c")
         with pytest.raises(UserError, match="brax_fast is simulated by brax"):
             mjx_walk.make_env("brax_fast")
-    with unregistered(), pytest.raises(UserError) as error:
-        mjx_walk.load_run(trained)
-    assert "'brax_fast'" in str(error.value) and "task=CLASS to run or load_run" in str(error.value)
+    for load in (lambda: mjx_walk.load_run(trained), lambda: pickle.loads(pickled)):
+        with unregistered(), pytest.raises(UserError) as error:
+            load()
+        says = "pass task=CLASS to run or load_run, or call mjx_walk.register_task first"
+        assert "'brax_fast'" in str(error.value) and says in str(error.value)
 
 
 def test_commands_take_the_task_from_a_file(trained, tmp_path, capsys, monkeypatch):

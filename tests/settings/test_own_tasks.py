@@ -1,5 +1,6 @@
 """Runs of a user's own task: trained, loaded, scored and resumed; a stranger's file never runs unnamed."""
 
+import pickle
 import shutil
 
 import pytest
@@ -65,6 +66,10 @@ def test_a_task_from_a_file_needs_no_name_later(home, capsys):
     config = read_config(home / "work" / "run" / "config.yaml")
     assert (config.env.name, config.env.healthy_reward) == ("fast_walker", 0.5)
     assert config.env.task == f"{home}/work/t.py:FastWalker" and config.total_steps == TINY_CALL
+    pickled = pickle.dumps(mjx_walk.load_run("run"))
+    as_in_a_new_process()
+    (home / "ran").unlink()
+    assert pickle.loads(pickled).config.env.healthy_reward == 0.5 and (home / "ran").exists()
     as_in_a_new_process()
     (home / "ran").unlink()
     assert command_here("eval", "run=run", "episodes=1") == 0
@@ -102,7 +107,11 @@ def test_a_class_from_python(home, capsys):
 
     run = mjx_walk.run([*OWN, "run_dir=run", f"total_steps={TINY_CALL}"], task=LazyWalker)
     assert run.config.env.name == "lazy_walker" and run.evaluate(episodes=1).env == "lazy_walker on c"
+    pickled = pickle.dumps(run)
+    assert pickle.loads(pickled).config == run.config
     as_in_a_new_process("lazy_walker")
+    with pytest.raises(UserError, match=r"or call mjx_walk\.register_task first"):
+        pickle.loads(pickled)
     line = refused(capsys, "eval", "run=run")
     assert line.startswith("error: the task 'lazy_walker' of run/config.yaml is not registered; add env.")
     assert mjx_walk.load_run("run", task=LazyWalker).task.observation_size == 17
