@@ -100,6 +100,8 @@ def load_compiled_spec(xml_file: str) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     except ValueError as error:
         if "(increase <size memory" in str(error):
             raise UserError(f"{path}: {_TOO_LITTLE_MEMORY}") from error
+        if "could not find decoder" in str(error):
+            raise UserError(f"MuJoCo tells by the ending of {path} how to read it; let it end in .xml") from error
         raise UserError(f"MuJoCo cannot read {path}: {_in_one_line(str(error))}") from error
     if not _has_enough_memory(path, model):
         raise UserError(f"{path}: {_TOO_LITTLE_MEMORY}")

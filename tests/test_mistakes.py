@@ -64,7 +64,8 @@ def folder(tmp_path_factory):
     (path / "no_motors.xml").write_text(MODEL.format(SLIDES))
     (path / "attribute.xml").write_text(MODEL.format('\n<joint kind="slide"/>'))
     (path / "unclosed.xml").write_text("<mujoco>\n<worldbody>\n</mujoco>\n")
-    (path / "text.txt").write_text("some text\n")
+    for name in ("text.txt", "text.xml"):
+        (path / name).write_text("some text\n")
     (path / "reward.py").write_text("def speed(step):\n    return {}\n")
     (path / "raises.py").write_text("import no_such_module\n")
     return path
