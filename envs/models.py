@@ -103,7 +103,8 @@ def load_compiled_spec(xml_file: str) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
         if "could not find decoder" in str(error):
             raise UserError(f"MuJoCo tells by the ending of {path} how to read it; let it end in .xml") from error
         raise UserError(f"MuJoCo cannot read {path}: {_in_one_line(str(error))}") from error
-    if not _has_enough_memory(path, model):
+    has_sizes = any(size >= 0 for size in (spec.memory, spec.nstack, spec.njmax, spec.nconmax))
+    if has_sizes and not _has_enough_memory(path, model):
         raise UserError(f"{path}: {_TOO_LITTLE_MEMORY}")
     return spec, model
 
@@ -120,8 +121,6 @@ def _has_enough_memory(path: Path, model: mujoco.MjModel) -> bool:
     With less, MuJoCo leaves out constraints, or stops with an error in the middle of an episode.
     """
     spec = load_spec(str(path))
-    if all(size < 0 for size in (spec.memory, spec.nstack, spec.njmax, spec.nconmax)):  # MuJoCo chooses
-        return True
     spec.memory = spec.nstack = spec.njmax = spec.nconmax = -1
     with warnings.catch_warnings(action="ignore"), hide_deprecations():
         if model.narena >= spec.compile().narena:
