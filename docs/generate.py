@@ -6,7 +6,16 @@ a test fails if a committed page differs.
 
 from pathlib import Path
 
-from generator import best_recipes, measured_tables, scaling, score_tables, seed_tables, setting_tables, task_pages
+from generator import (
+    best_recipes,
+    fresh_seeds,
+    measured_tables,
+    scaling,
+    score_tables,
+    seed_tables,
+    setting_tables,
+    task_pages,
+)
 from generator.markdown import toctree, with_block
 
 from mjx_walk import zoo
@@ -54,6 +63,7 @@ def _figures() -> dict[str, dict[str, str]]:
     scores = {"all-tasks": best_recipes.detailed(), "comparison": best_recipes.comparison()}
     scores |= {"recipes": score_tables.recipes(), "suite": score_tables.suite(), "zoo": zoo.table()}
     scores |= {"published": score_tables.published(True), "published-runs": score_tables.published(False)}
+    scores |= {"frozen-seeds": fresh_seeds.seeds(), "frozen-means": fresh_seeds.means()}
     scores |= {"csac-seeds": seed_tables.csac_seeds(), "csac-means": seed_tables.csac_means()}
     scores |= {"fresh-seeds": seed_tables.other_algorithms(), "ppo-suite": seed_tables.ppo_on_other_tasks()}
     scores |= {name: measured.pop(name) for name in _OF_SCORES}

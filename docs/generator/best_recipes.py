@@ -4,7 +4,7 @@ import re
 from typing import NamedTuple
 
 from generator.markdown import code, table
-from generator.score_tables import highest_published, number, read
+from generator.score_tables import highest_published, number, read, results
 from mjx_walk.experiments.suite import REFERENCES
 
 _ONE_SEED = {
@@ -39,7 +39,7 @@ def best_recipes() -> list[Best]:
     Recipes with several seeds count before those with one. At equal scores, the shorter training counts.
     """
     several: dict[str, list[Best]] = {}
-    for row in read("results.csv"):
+    for row in results():
         if row["policy"] == "final":
             several.setdefault(row["task"], []).append(_of_several_seeds(row))
     one: dict[str, list[Best]] = {}
@@ -62,7 +62,7 @@ def _of_several_seeds(row: dict[str, str]) -> Best:
         seeds=row["seeds"],
         million_steps=row["million_steps"],
         seconds=alone or row["seconds"],
-        shared_with=_DASH if alone else f"{others} other seeds",
+        shared_with=_DASH if alone else f"{others} other seeds" + ", other runs" * row["time_of"].endswith("shared"),
         command=row["command"],
     )
 

@@ -1,4 +1,4 @@
-"""Tables of scores. The figures are in results.csv, published.csv and experiments.csv."""
+"""Tables of scores. The figures are in results.csv, published.csv, experiments.csv and the archive of fresh seeds."""
 
 import csv
 import re
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 
+from generator import fresh_seeds
 from generator.markdown import code, table
 from mjx_walk.experiments.suite import REFERENCES, normalize
 from mjx_walk.utils.text import format_score
@@ -50,6 +51,12 @@ def claims() -> str:
     return table(titles, rows)
 
 
+def results() -> list[dict[str, str]]:
+    """The scores of each recipe, those of fresh seeds included: the highest ones of a task first."""
+    rows = [*read("results.csv"), *fresh_seeds.recipes()]
+    return sorted(rows, key=lambda row: (list(REFERENCES).index(row["task"]), -float(row["score"])))
+
+
 def recipes() -> str:
     """Every recipe for a GPU that has been scored."""
     titles = ("Task", "Algorithm", "Policy", ">Score", ">Std", ">Lowest seed", ">Seeds", ">Steps (M)")
@@ -62,7 +69,7 @@ def recipes() -> str:
             number(row["alone_seconds"]),
             code(row["command"]),
         )
-        for row in read("results.csv")
+        for row in results()
     ]
     return table((*titles, *times, "Command"), rows)
 
@@ -74,7 +81,7 @@ def of_algorithm(name: str) -> str:
             *(row["task"], row["algorithm"], row["policy"], number(row["score"]), number(row["std"]), row["seeds"]),
             *(row["million_steps"], code(row["command"])),
         )
-        for row in read("results.csv")
+        for row in results()
         if re.match(rf"{name}\b", row["algorithm"], flags=re.IGNORECASE)
     ]
     return table(("Task", "Algorithm", "Policy", ">Score", ">Std", ">Seeds", ">Steps (M)", "Command"), rows)

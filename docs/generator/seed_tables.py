@@ -5,8 +5,8 @@ import scipy.stats
 from generator.markdown import table
 from generator.score_tables import number, read
 
-_CSAC = ("LP1", "LP2", "LP3")
-"""Arms of csac, one for each tuned task."""
+_CSAC = ("LP1", "LP3")
+"""Arms of csac, one for each task."""
 _OTHERS = {
     "LP4": "PPO",
     "LP5": "SAC",

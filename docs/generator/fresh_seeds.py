@@ -1,0 +1,96 @@
+"""Scores of the seeds on which no recipe was tuned, from the logs of their runs in measured/fresh_seeds.tar.xz."""
+
+import functools
+import itertools
+import tarfile
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import scipy.stats
+
+from generator.markdown import table
+from mjx_walk.experiments.logged_runs import LoggedRun, read_runs
+from mjx_walk.experiments.suite import REFERENCES
+from mjx_walk.storage.scores import BEST, FINAL
+from mjx_walk.utils.text import format_score
+
+ARCHIVE = Path(__file__).parents[1] / "measured" / "fresh_seeds.tar.xz"
+"""For each run its `config.yaml`, `inputs.json`, `metrics.jsonl` and `eval_gymnasium.json`."""
+
+
+@functools.cache
+def runs() -> list[LoggedRun]:
+    """The runs of the archive, by task, algorithm and seed."""
+    with tempfile.TemporaryDirectory() as folder, tarfile.open(ARCHIVE) as archive:
+        archive.extractall(folder, filter="data")
+        found = read_runs(Path(folder))
+    tasks = list(REFERENCES)
+    return sorted(found, key=lambda run: (tasks.index(run.task), run.config.algo.name, run.config.seed))
+
+
+def recipes() -> list[dict[str, str]]:
+    """The final policies of each recipe, with the columns of results.csv."""
+    rows = []
+    for (task, algorithm), same in _blocks():
+        scores = _means(same, FINAL)
+        row = {
+            **{"task": task, "algorithm": _shown(algorithm), "policy": FINAL},
+            **{"score": _in_csv(np.mean(scores)), "std": _in_csv(np.std(scores, ddof=1))},
+            **{"lowest_seed": _in_csv(min(scores)), "seeds": str(len(same)), "million_steps": _millions(same[0])},
+            **{"seconds": f"{_seconds(same[0]):.0f}", "seeds_per_process": f"{same[0].seeds_together:.0f}"},
+            **{"time_of": "training, GPU shared", "alone_seconds": ""},
+            "command": f"env={same[0].config.env.name} algo={algorithm}",
+        }
+        rows.append(row)
+    return rows
+
+
+def seeds() -> str:
+    """The final and the best policy of every seed."""
+    rows = []
+    for run in runs():
+        final, best = ([block["mean"], block["std"], min(block["returns"])] for block in map(run.score, (FINAL, BEST)))
+        rows.append([run.task, _shown(run.config.algo.name), str(run.config.seed), *map(format_score, final + best)])
+    titles = ("Task", "Algorithm", ">Seed", ">Final", ">Std", ">Lowest", ">Best", ">Its std", ">Its lowest")
+    return table(titles, rows)
+
+
+def means() -> str:
+    """Means over the seeds, with Student's 95% intervals."""
+    rows = []
+    for (task, algorithm), same in _blocks():
+        final, best = _means(same, FINAL), _means(same, BEST)
+        half = scipy.stats.t.ppf(0.975, len(final) - 1) * scipy.stats.sem(final)
+        values = (np.mean(final), np.std(final, ddof=1), np.mean(final) - half, np.mean(final) + half, min(final))
+        cells = [format_score(value) for value in (*values, np.mean(best))]
+        rows.append([task, _shown(algorithm), *cells, _millions(same[0]), f"{_seconds(same[0]):,.0f}"])
+    titles = ("Task", "Algorithm", ">Final, mean over seeds", ">Std over seeds", ">Interval from", ">Interval to")
+    return table((*titles, ">Lowest seed", ">Best, mean over seeds", ">Steps (M)", ">Training of all seeds (s)"), rows)
+
+
+def _blocks() -> list[tuple[tuple[str, str], list[LoggedRun]]]:
+    """The runs of each task and algorithm."""
+    grouped = itertools.groupby(runs(), key=lambda run: (run.task, run.config.algo.name))
+    return [(key, list(same)) for key, same in grouped]
+
+
+def _means(same: list[LoggedRun], policy: str) -> list[float]:
+    return [run.score(policy)["mean"] for run in same]
+
+
+def _shown(algorithm: str) -> str:
+    return algorithm if algorithm == "csac" else algorithm.upper()
+
+
+def _millions(run: LoggedRun) -> str:
+    return f"{run.rows[-1]['env_steps'] / 1e6:.1f}"
+
+
+def _seconds(run: LoggedRun) -> float:
+    return run.rows[-1]["wall_seconds"]
+
+
+def _in_csv(value: float) -> str:
+    """A score as results.csv has it: whole numbers from 1,000 on."""
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.2f}"
