@@ -7,7 +7,6 @@ import os
 import sys
 import textwrap
 import traceback
-import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -149,14 +148,19 @@ def _through_hydra(arguments: list[str]) -> None:
     Raises:
         UserError: invalid arguments, or Hydra refuses them.
     """
-    flags, given = _split(arguments)
-    parsing.refuse_flags(given, key_of_value, typing.get_type_hints(Config) | typing.get_type_hints(Own))
+    flags, others = _split(arguments)
+    own, given = parsing.parse_own(Own, Config, others, USAGE, key_of_value)
     for flag in _CFG & flags.keys():
         if flags[flag] not in _PRINTED:
             raise UserError(f"{flag} prints a configuration; write --cfg job, --cfg hydra or --cfg all")
     if flags in ({"--cfg": "job"}, {"-c": "job"}):
         print(as_yaml_with_sources(given), end="")
         return
+    for name, value in dataclasses.asdict(own).items():
+        if value is not None:
+            raise UserError(
+                f"{name}=… does not go with {next(iter(flags))}; leave it out, or sweep seeds with -m seed=0,1,2"
+            )
     is_sweep = bool(_MULTIRUN & flags.keys())
     overrides = read_overrides(given, is_sweep)
     swept = [override for override in overrides if override.is_sweep_override()]

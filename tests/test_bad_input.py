@@ -83,6 +83,7 @@ CASES = [
     (["env=walker2d", "env.version=v4", "env.frame_skip=2"], "walker2d v4 does not take frame_skip"),
     (["resume=true"], "resume=true needs run_dir"),
     (["-m", "hydra/launcher=nowhere", "seed=0,1"], "Could not find 'hydra/launcher/nowhere' Available options"),
+    (["-m", "env=ant,hopper", "seeds=2"], "seeds=… does not go with -m; leave it out, or sweep seeds"),
     (["-m", "seed=0,1", "--cfg", "job"], "-m trains a sweep and --cfg prints a configuration"),
     (["resume=true", "run_dir=/nowhere/at/all"], "no run at '/nowhere/at/all'"),
 ]

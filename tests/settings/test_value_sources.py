@@ -122,6 +122,12 @@ def test_a_mistake_is_one_line(given, says):
     assert str(error.value).startswith(says) and "\n" not in str(error.value)
 
 
+def test_with_several_seeds_it_is_the_configuration_that_they_share(printed, capsys):
+    text = printed("env=hopper")
+    assert train_command.main(["env=hopper", "seeds=[3,4]", "--cfg", "job"]) == 0
+    assert capsys.readouterr().out == text
+
+
 @pytest.mark.parametrize("flags", [["--package", "evaluation"], ["--resolve"]])
 def test_with_other_flags_hydra_prints(flags, capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train"])
