@@ -31,7 +31,7 @@ class VectorState(flax.struct.PyTreeNode):
     started_at_reset: jax.Array
     """`[B] bool`: the current episode started at a reset, so its sums count."""
     pool: State
-    """`[B, …]` fresh random resets."""
+    """`[B, …]` fresh random resets, whose step counts are random if episodes may start at one."""
     pool_used: jax.Array
     """`[] i32`: starts taken since the pool was renewed."""
 
@@ -54,8 +54,9 @@ class VectorEnv:
         Args:
             task: the unbatched environment.
             num_envs: number of environments that train, B.
-            init_at_random_episode_step: start the first episodes at random step counts, so that time limits do not
-                end all episodes at once. The episode metrics leave out these first, shorter episodes.
+            init_at_random_episode_step: start the first episodes at random step counts, and every second one that
+                follows a fall, so that time limits do not end all episodes at once. The episode metrics leave out
+                these shorter episodes.
         """
         self.task = task
         self.num_envs = num_envs
@@ -66,14 +67,13 @@ class VectorEnv:
         env_key, pool_key, episode_step_key = jax.random.split(key, 3)
         env = self._reset_many(env_key)
         if self.init_at_random_episode_step:
-            limit = self.task.options.max_episode_steps
-            env = env.replace(steps=jax.random.randint(episode_step_key, (self.num_envs,), 0, limit, jnp.int32))
+            env = env.replace(steps=self._random_steps(episode_step_key))
         zeros = jnp.zeros(self.num_envs, jnp.float32)
         return VectorState(
             env=env,
             sums=EpisodeSums(zeros, dict.fromkeys(self.task.reward_terms, zeros)),
             started_at_reset=env.steps == 0,
-            pool=self._reset_many(pool_key),
+            pool=self._draw_pool(pool_key),
             pool_used=jnp.zeros((), jnp.int32),
         )
 
@@ -82,7 +82,17 @@ class VectorEnv:
 
         The observation of a reset needs a forward pass, which is too expensive for every environment at every step.
         """
-        return state.replace(pool=self._reset_many(key), pool_used=jnp.zeros((), jnp.int32))
+        return state.replace(pool=self._draw_pool(key), pool_used=jnp.zeros((), jnp.int32))
+
+    def _draw_pool(self, key: jax.Array) -> State:
+        pool = self._reset_many(key)
+        if not self.init_at_random_episode_step:
+            return pool
+        return pool.replace(steps=self._random_steps(jax.random.fold_in(key, 1)))
+
+    def _random_steps(self, key: jax.Array) -> jax.Array:
+        limit = self.task.options.max_episode_steps
+        return jax.random.randint(key, (self.num_envs,), 0, limit, jnp.int32)
 
     def _reset_many(self, key: jax.Array) -> State:
         return jax.vmap(self.task.reset)(jax.random.split(key, self.num_envs))
@@ -112,6 +122,9 @@ class VectorEnv:
         num_done = done.sum(dtype=jnp.int32)
         start = (state.pool_used + jnp.cumsum(done) - 1) % self.num_envs
         starts = jax.tree.map(lambda x: x[start], state.pool)
+        # Environments that fall and learn at the same time would otherwise reach the time limit at the same time.
+        is_random = env.terminated & state.started_at_reset
+        starts = starts.replace(steps=jnp.where(is_random, starts.steps, 0))
         pool_used = state.pool_used + num_done
         reused = jnp.maximum(pool_used - self.num_envs, 0) - jnp.maximum(state.pool_used - self.num_envs, 0)
         ended = jnp.float32(done & state.started_at_reset)
@@ -130,7 +143,7 @@ class VectorEnv:
         next_state = state.replace(
             env=jax.tree.map(lambda new, old: _where(done, new, old), starts, env),
             sums=jax.tree.map(lambda x: jnp.where(done, 0.0, x), sums),
-            started_at_reset=state.started_at_reset | done,
+            started_at_reset=jnp.where(done, starts.steps == 0, state.started_at_reset),
             pool_used=pool_used,
         )
         metrics = {name: Metric(value, Reduction.SUM) for name, value in counts.items()}

@@ -50,7 +50,7 @@ class AlgorithmConfig(Protocol):
     """Settings that every algorithm has."""
 
     init_at_random_episode_step: bool
-    """Start the first episodes at random step counts."""
+    """Start the first episodes, and every second one after a fall, at random step counts."""
 
 
 _StateT = TypeVar("_StateT", bound=TrainState)

@@ -75,4 +75,5 @@ class OffPolicyConfig:
     network_dtype: str = setting("float32", choices=("float32", "bfloat16"))
     """Dtype in which networks compute. Parameters, losses and optimizers are float32."""
     init_at_random_episode_step: bool = True
-    """Start the first episodes at random step counts, so that time limits do not end all episodes at once."""
+    """Start the first episodes, and every second one after a fall, at random step counts, so that time limits do not
+    end many episodes at once."""

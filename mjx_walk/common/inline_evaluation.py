@@ -88,12 +88,13 @@ class InlineEvaluator:
 
         Args:
             policy_params: the policy to evaluate.
-            starts: at least E fresh resets.
+            starts: at least E fresh resets, whose step counts do not matter.
         """
+        env = jax.tree.map(lambda x: x[: self.num_envs], starts)
         return InlineEvaluation(
             policy_params=policy_params,
             snapshot_iteration=jnp.zeros((), jnp.int32),
-            env=jax.tree.map(lambda x: x[: self.num_envs], starts),
+            env=env.replace(steps=jnp.zeros_like(env.steps)),
             alive=jnp.ones(self.num_envs, bool),
             returns=jnp.zeros(self.num_envs, jnp.float32),
             lengths=jnp.zeros(self.num_envs, jnp.int32),
@@ -129,7 +130,7 @@ class InlineEvaluator:
             evaluation: the present round.
             policy_params: the present policy.
             iteration: `[] i32`, iterations so far.
-            starts: at least E fresh resets.
+            starts: at least E fresh resets, whose step counts do not matter.
 
         Returns:
             The round to continue; and its scores, which have a value where a round has ended: `eval_return`,

@@ -48,10 +48,11 @@ def test_a_round_of_evaluation_is_not_begun_too_early(walker):
 
 def test_inline_evaluation_equals_an_evaluation_on_its_own(walker):
     """Deterministic episodes in the training batch return what the same episodes return alone."""
-    env = VectorEnv(walker, 3)
+    env = VectorEnv(walker, 3, init_at_random_episode_step=True)
     evaluator = InlineEvaluator(walker, 3, EvaluationConfig(2), still(walker), steps_per_iteration=3)
     state, evaluation = init(env, evaluator, jax.random.PRNGKey(0))
     starts = evaluation.env
+    assert (state.pool.steps[:2] > 0).all() and (starts.steps == 0).all()
     step = jax.jit(functools.partial(evaluator.step, env))
     for _ in range(30):
         state, evaluation, _, _ = step(state, evaluation, jnp.ones((3, 6)))

@@ -81,6 +81,38 @@ def test_truncated_copies_restart_from_different_starts_and_reuse_is_counted(wal
     assert step(state, others, jnp.zeros((4, 6)))[3]["resets_reused"].value == 0
 
 
+def test_every_second_episode_after_a_fall_starts_at_a_random_step_count(walker):
+    env = VectorEnv(walker, 64, init_at_random_episode_step=True)
+    state, others = init(env, jax.random.PRNGKey(0))
+    qpos = state.env.physics.qpos
+    lying = state.env.physics._replace(qpos=qpos.at[:32, 1].set(0.3))  # the first half falls, the others time out
+    state = state.replace(
+        env=state.env.replace(physics=lying, steps=jnp.where(jnp.arange(64) < 32, 0, 29)),
+        started_at_reset=jnp.ones(64, bool),
+    )
+    step, still = step_all(env), jnp.zeros((64, 6))
+    state, others, outcome, stats = step(state, others, still)
+    np.testing.assert_array_equal(outcome.terminated, np.arange(64) < 32)
+    assert len(np.unique(state.env.steps[:32])) > 10 and (state.env.steps[32:] == 0).all()
+    assert (state.env.steps < 30).all()
+    np.testing.assert_array_equal(state.started_at_reset, state.env.steps == 0)
+    assert values(stats)["episodes"] == 64
+
+    lying = state.env.physics._replace(qpos=state.env.physics.qpos.at[:32, 1].set(0.3))
+    next_state, _, outcome, stats = step(state.replace(env=state.env.replace(physics=lying)), others, still)
+    assert (next_state.env.steps[:32] == 0)[state.env.steps[:32] > 0].all()
+    assert values(stats)["episodes"] == (state.env.steps[:32] == 0).sum()
+
+
+def test_no_episode_starts_at_a_random_step_count_unless_asked(walker):
+    env = VectorEnv(walker, 64)
+    state, others = init(env, jax.random.PRNGKey(0))
+    lying = state.env.physics._replace(qpos=state.env.physics.qpos.at[:, 1].set(0.3))
+    state = state.replace(env=state.env.replace(physics=lying))
+    state, _, outcome, _ = step_all(env)(state, others, jnp.zeros((64, 6)))
+    assert outcome.terminated.all() and (state.env.steps == 0).all() and state.started_at_reset.all()
+
+
 def test_staggered_first_episodes_are_not_counted(walker):
     env = VectorEnv(walker, 32, init_at_random_episode_step=True)
     state, others = init(env, jax.random.PRNGKey(0))
