@@ -10,6 +10,7 @@ from generator import (
     best_recipes,
     fresh_seeds,
     measured_tables,
+    recipe_tables,
     scaling,
     score_tables,
     seed_tables,
@@ -53,6 +54,7 @@ def pages() -> dict[Path, str]:
     found[DOCS / "algorithms" / "index.md"] = _filled("algorithms/index.md", index)
     for name in BUILT_IN_ALGORITHMS:
         blocks = {"settings": setting_tables.algorithm_table(name), "scores": score_tables.of_algorithm(name)}
+        blocks["recipes"] = recipe_tables.differences(name)
         found[DOCS / "algorithms" / f"{name}.md"] = _filled(f"algorithms/{name}.md", blocks)
     return found
 
@@ -64,6 +66,7 @@ def _figures() -> dict[str, dict[str, str]]:
     scores |= {"recipes": score_tables.recipes(), "suite": score_tables.suite(), "zoo": zoo.table()}
     scores |= {"published": score_tables.published(True), "published-runs": score_tables.published(False)}
     scores |= {"frozen-seeds": fresh_seeds.seeds(), "frozen-means": fresh_seeds.means()}
+    scores["frozen-budgets"] = fresh_seeds.budgets()
     scores |= {"csac-seeds": seed_tables.csac_seeds(), "csac-means": seed_tables.csac_means()}
     scores |= {"fresh-seeds": seed_tables.other_algorithms(), "ppo-suite": seed_tables.ppo_on_other_tasks()}
     scores |= {name: measured.pop(name) for name in _OF_SCORES}

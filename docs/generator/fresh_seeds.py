@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from generator.markdown import table
+from mjx_walk.experiments.budgets import at_budgets
 from mjx_walk.experiments.logged_runs import LoggedRun, interval, read_runs
 from mjx_walk.experiments.suite import REFERENCES
 from mjx_walk.storage.scores import BEST, FINAL
@@ -69,6 +70,18 @@ def means() -> str:
         rows.append([task, _shown(algorithm), *cells, _millions(same[0]), f"{_seconds(same[0]):,.0f}"])
     titles = ("Task", "Algorithm", ">Final, mean over seeds", ">Std over seeds", ">Interval from", ">Interval to")
     return table((*titles, ">Lowest seed", ">Best, mean over seeds", ">Steps (M)", ">Training of all seeds (s)"), rows)
+
+
+def budgets() -> str:
+    """Mean returns of the evaluations during training after equal steps, and of the final policies."""
+    steps = ("1M steps", "5M steps")
+    rows = []
+    for (task, algorithm), same in _blocks():
+        reached = at_budgets(same)
+        final = format_score(float(np.mean(_means(same, FINAL))))
+        rows.append([task, _shown(algorithm), *(reached[title] for title in steps), final, _millions(same[0])])
+    titles = [f">After {title}" for title in steps]
+    return table(("Task", "Algorithm", *titles, ">Final", ">Steps of the final (M)"), rows)
 
 
 def _blocks() -> list[tuple[tuple[str, str], list[LoggedRun]]]:
