@@ -21,8 +21,6 @@ from shared_programs import shared_programs
 from mjx_walk.algos import ALGORITHMS
 from mjx_walk.algos.on_policy_config import OnPolicyConfig
 from mjx_walk.envs import registry
-from mjx_walk.settings.config import load_config
-from mjx_walk.settings.saved_config import save_config
 from mjx_walk.storage import checkpoint
 from mjx_walk.storage.checkpoint_metadata import read_metadata, write_metadata
 from mjx_walk.utils.errors import UserError
@@ -285,18 +283,3 @@ def slow_except(fast, cases):
 def values(metrics):
     """The numbers of metrics, by their names."""
     return {name: metric.value for name, metric in metrics.items()}
-
-
-def fake_run(folder, overrides, returns, score=None):
-    """A run folder whose return rises along `returns`, one row a million steps and ten seconds."""
-    folder.mkdir(parents=True)
-    config = load_config([*overrides, f"run_dir='{folder}'"])
-    save_config(config, folder / "config.yaml")
-    rows = [
-        {"env_steps": 1e6 * i, "wall_seconds": 10.0 * i, "episode/return": value, "episode/length": 10 * value}
-        for i, value in enumerate(returns, start=1)
-    ]
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    if score is not None:
-        blocks = {"final": {"mean": score, "std": 1.0}, "best": {"mean": score + 10.0, "std": 2.0}}
-        (folder / "eval_gymnasium.json").write_text(json.dumps({"env": "Walker2d-v5", **blocks}))

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
+from fake_runs import fake_run
 from helpers import (
     CLONE,
     ENVIRONMENT,
@@ -21,7 +22,6 @@ from helpers import (
     blocks,
     command,
     command_here,
-    fake_run,
     unregistered,
 )
 from shared_programs import shared_programs

@@ -7,7 +7,8 @@ import signal
 import subprocess
 
 import pytest
-from helpers import TINY, TINY_CALL, command, command_here, fake_run, finish, start, wait_for_rows
+from fake_runs import fake_run
+from helpers import TINY, TINY_CALL, command, command_here, finish, start, wait_for_rows
 
 from mjx_walk import compare as compare_command
 from mjx_walk.experiments import planned_runs, slots, suite

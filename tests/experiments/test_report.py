@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers import fake_run
+from fake_runs import fake_run
 
 from mjx_walk.envs import TASKS, make_options
 from mjx_walk.experiments import logged_runs, report, suite

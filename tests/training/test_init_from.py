@@ -8,7 +8,8 @@ import shutil
 import jax
 import numpy as np
 import pytest
-from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command_here, edit_config, fake_run, train_here
+from fake_runs import fake_run
+from helpers import TINY, TINY_CALL, TINY_OFF_POLICY, command_here, edit_config, train_here
 
 import mjx_walk
 from mjx_walk.algos import make_algorithm
