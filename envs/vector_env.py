@@ -31,7 +31,7 @@ class VectorState(flax.struct.PyTreeNode):
     started_at_reset: jax.Array
     """`[B] bool`: the current episode started at a reset, so its sums count."""
     pool: State
-    """`[B, …]` fresh random resets, whose step counts are random if episodes may start at one."""
+    """`[B, …]` fresh random resets, whose step counts are random if episodes that follow a fall may start at one."""
     pool_used: jax.Array
     """`[] i32`: starts taken since the pool was renewed."""
 
@@ -49,18 +49,26 @@ class Outcome(NamedTuple):
 class VectorEnv:
     """`num_envs` environments that train. Others, which it does not reset, join their physics calls."""
 
-    def __init__(self, task: BaseTask, num_envs: int, init_at_random_episode_step: bool = False):
+    def __init__(
+        self,
+        task: BaseTask,
+        num_envs: int,
+        init_at_random_episode_step: bool = False,
+        random_step_after_falls: bool = False,
+    ):
         """
         Args:
             task: the unbatched environment.
             num_envs: number of environments that train, B.
-            init_at_random_episode_step: start the first episodes at random step counts, and every second one that
-                follows a fall, so that time limits do not end all episodes at once. The episode metrics leave out
-                these shorter episodes.
+            init_at_random_episode_step: start the first episodes at random step counts, so that time limits do not
+                end all episodes at once. The episode metrics leave out these first, shorter episodes.
+            random_step_after_falls: start every second episode that follows a fall at a random step count, too.
+                Environments that fall and learn at the same time would otherwise reach the time limit together.
         """
         self.task = task
         self.num_envs = num_envs
         self.init_at_random_episode_step = init_at_random_episode_step
+        self.random_step_after_falls = random_step_after_falls
 
     def init(self, key: jax.Array) -> VectorState:
         """All environments freshly reset, with a new pool."""
@@ -86,7 +94,7 @@ class VectorEnv:
 
     def _draw_pool(self, key: jax.Array) -> State:
         pool = self._reset_many(key)
-        if not self.init_at_random_episode_step:
+        if not self.random_step_after_falls:
             return pool
         return pool.replace(steps=self._random_steps(jax.random.fold_in(key, 1)))
 
@@ -122,7 +130,6 @@ class VectorEnv:
         num_done = done.sum(dtype=jnp.int32)
         start = (state.pool_used + jnp.cumsum(done) - 1) % self.num_envs
         starts = jax.tree.map(lambda x: x[start], state.pool)
-        # Environments that fall and learn at the same time would otherwise reach the time limit at the same time.
         is_random = env.terminated & state.started_at_reset
         starts = starts.replace(steps=jnp.where(is_random, starts.steps, 0))
         pool_used = state.pool_used + num_done

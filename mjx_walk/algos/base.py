@@ -3,7 +3,7 @@
 import abc
 import copy
 import dataclasses
-from typing import Generic, Protocol, TypeVar
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 import flax
 import jax
@@ -50,7 +50,7 @@ class AlgorithmConfig(Protocol):
     """Settings that every algorithm has."""
 
     init_at_random_episode_step: bool
-    """Start the first episodes, and every second one after a fall, at random step counts."""
+    """Start the first episodes at random step counts."""
 
 
 _StateT = TypeVar("_StateT", bound=TrainState)
@@ -101,6 +101,9 @@ class Algorithm(abc.ABC, Generic[_StateT, _BatchT, _ConfigT]):
     `jit`; constants are built when it is constructed.
     """
 
+    random_step_after_falls: ClassVar[bool] = False
+    """Whether `init_at_random_episode_step` also holds for every second episode that follows a fall."""
+
     task: BaseTask
     """The unbatched environment."""
     num_envs: int
@@ -118,7 +121,8 @@ class Algorithm(abc.ABC, Generic[_StateT, _BatchT, _ConfigT]):
         # Configurations are mutable, and the hash would not change with them.
         self._set(config=copy.deepcopy(self.config), evaluation=copy.deepcopy(self.evaluation))
         evaluator = InlineEvaluator(self.task, self.num_envs, self.evaluation, self.policy, self.steps_per_iteration)
-        env = VectorEnv(self.task, self.num_envs, self.config.init_at_random_episode_step)
+        is_random = self.config.init_at_random_episode_step
+        env = VectorEnv(self.task, self.num_envs, is_random, is_random and self.random_step_after_falls)
         self._set(evaluator=evaluator, env=env)
 
     def _set(self, **constants: object) -> None:

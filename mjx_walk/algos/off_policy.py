@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -45,6 +45,8 @@ class OffPolicyAlgorithm(
     Raises:
         UserError: settings that exclude each other.
     """
+
+    random_step_after_falls: ClassVar[bool] = True
 
     buffer: ReplayBuffer = dataclasses.field(init=False, repr=False)
     optimizer: optax.GradientTransformation = dataclasses.field(init=False, repr=False)

@@ -77,5 +77,4 @@ class OnPolicyConfig:
     max_log_std: float = setting(2.0, at_least=-80, at_most=80, only_if={"distribution": "normal"})
     """Upper bound. A value equal to `min_log_std` fixes the std."""
     init_at_random_episode_step: bool = True
-    """Start the first episodes, and every second one after a fall, at random step counts, so that time limits do not
-    end many episodes at once."""
+    """Start the first episodes at random step counts, so that time limits do not end all episodes at once."""

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from helpers import small_settings
+from helpers import OFF_POLICY, small_settings
 from toy_tasks import EndlessReward
 
 from mjx_walk.algos import ALGORITHMS, is_finite, learned_leaves, make_algorithm
@@ -49,3 +49,12 @@ def test_one_value_that_is_not_finite_in_any_learned_leaf_is_noticed(algo):
         assert not check(state), name
         leaf.flat[-1] = 0
     assert check(state)
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("is_random", [True, False])
+def test_only_replays_get_random_step_counts_after_falls(algo, is_random):
+    config = ALGORITHMS[algo][1](**small_settings(algo, init_at_random_episode_step=is_random))
+    algorithm = make_algorithm(EndlessReward(), 4, EvaluationConfig(num_envs=2), config)
+    assert algorithm.env.init_at_random_episode_step == is_random
+    assert algorithm.env.random_step_after_falls == (is_random and algo in OFF_POLICY)

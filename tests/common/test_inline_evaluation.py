@@ -48,7 +48,7 @@ def test_a_round_of_evaluation_is_not_begun_too_early(walker):
 
 def test_inline_evaluation_equals_an_evaluation_on_its_own(walker):
     """Deterministic episodes in the training batch return what the same episodes return alone."""
-    env = VectorEnv(walker, 3, init_at_random_episode_step=True)
+    env = VectorEnv(walker, 3, random_step_after_falls=True)
     evaluator = InlineEvaluator(walker, 3, EvaluationConfig(2), still(walker), steps_per_iteration=3)
     state, evaluation = init(env, evaluator, jax.random.PRNGKey(0))
     starts = evaluation.env

@@ -82,7 +82,7 @@ def test_truncated_copies_restart_from_different_starts_and_reuse_is_counted(wal
 
 
 def test_every_second_episode_after_a_fall_starts_at_a_random_step_count(walker):
-    env = VectorEnv(walker, 64, init_at_random_episode_step=True)
+    env = VectorEnv(walker, 64, random_step_after_falls=True)
     state, others = init(env, jax.random.PRNGKey(0))
     qpos = state.env.physics.qpos
     lying = state.env.physics._replace(qpos=qpos.at[:32, 1].set(0.3))  # the first half falls, the others time out
@@ -105,7 +105,7 @@ def test_every_second_episode_after_a_fall_starts_at_a_random_step_count(walker)
 
 
 def test_no_episode_starts_at_a_random_step_count_unless_asked(walker):
-    env = VectorEnv(walker, 64)
+    env = VectorEnv(walker, 64, init_at_random_episode_step=True)
     state, others = init(env, jax.random.PRNGKey(0))
     lying = state.env.physics._replace(qpos=state.env.physics.qpos.at[:, 1].set(0.3))
     state = state.replace(env=state.env.replace(physics=lying))
