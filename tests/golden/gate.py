@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from cases import NUM_ITERATIONS, ON_POLICY, Case, fast_cases, further_cases
 from xla_flags import SAFE_REDUCTIONS, quick_compile
 
-REFERENCE = "9c96b95"
+REFERENCE = "c69909b"
 """Rebased by a commit that changes bits on purpose, and says which operation."""
 TREE = Path(__file__).resolve().parents[2]
 _NOT_COMPARED = ("wall_seconds", "speed/")
