@@ -10,16 +10,22 @@ import pytest
 from helpers import CLONE
 
 from mjx_walk.settings.config import training_command
+from mjx_walk.utils.errors import UserError
 
 DOCS = CLONE / "docs"
 ARCHIVE = DOCS / "measured" / "fresh_seeds.tar.xz"
 
 
-@pytest.fixture(scope="module")
-def runs():
+@pytest.fixture(scope="module", autouse=True)
+def docs_path():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(DOCS))
-        return importlib.import_module("generator.fresh_seeds").runs()
+        yield
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return importlib.import_module("generator.fresh_seeds").runs()
 
 
 def test_every_seed_has_100_episodes_of_both_policies(runs):
@@ -57,3 +63,39 @@ def test_the_archive_is_small_and_names_no_folder_of_a_user():
     with tarfile.open(ARCHIVE) as archive:
         configs = [archive.extractfile(name).read() for name in archive.getnames() if name.endswith("config.yaml")]
     assert configs and all(b"\nrun_dir: null\n" in config for config in configs)
+
+
+def contents(path):
+    with tarfile.open(path) as archive:
+        return [(member, archive.extractfile(member).read()) for member in archive.getnames()]
+
+
+def test_adding_the_runs_of_the_archive_gives_the_same_archive(tmp_path):
+    add = importlib.import_module("add_fresh_seeds").add
+    with tarfile.open(ARCHIVE) as archive:
+        archive.extractall(tmp_path, filter="data")
+    config = tmp_path / "walker2d_csac" / "seed_300" / "config.yaml"
+    config.write_text(config.read_text().replace("\nrun_dir: null\n", "\nrun_dir: /home/me/run\n"))
+    add([tmp_path / "walker2d_csac"], tmp_path / "one.tar.xz")
+    add([tmp_path], tmp_path / "all.tar.xz")
+    add([tmp_path / "walker2d_csac"], tmp_path / "all.tar.xz")
+    assert contents(tmp_path / "all.tar.xz") == contents(ARCHIVE)
+    assert len(contents(tmp_path / "one.tar.xz")) == 5 * 4
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "says"),
+    [
+        ("eval_gymnasium.json", '"best"', '"other"', "walker2d csac seed=300 has no score of 100 episodes"),
+        ("config.yaml", "\nseed: 300\n", "\nseed: 3\n", "walker2d csac seed=3: recipes are tuned on seeds below 100"),
+        ("config.yaml", "total_steps: 13000000", "total_steps: 14000000", "walker2d csac seed=300 has not ended"),
+    ],
+)
+def test_unfinished_runs_are_not_added(file, old, new, says, tmp_path):
+    with tarfile.open(ARCHIVE) as archive:
+        archive.extractall(tmp_path, filter="data")
+    path = tmp_path / "walker2d_csac" / "seed_300" / file
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(UserError, match=says):
+        importlib.import_module("add_fresh_seeds").add([path.parent], tmp_path / "new.tar.xz")
+    assert not (tmp_path / "new.tar.xz").exists()
