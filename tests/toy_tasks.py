@@ -27,8 +27,8 @@ class ToyTask(TrainableTask):
         """`(qpos, qvel)`."""
         return jnp.zeros(1), jnp.zeros(1)
 
-    def move(self, qpos, qvel, action, steps):
-        """`(qpos, qvel, reward, terminated)`; `steps` are those before this one."""
+    def move(self, qpos, qvel, action):
+        """`(qpos, qvel, reward, terminated)`."""
         raise NotImplementedError
 
     def observe(self, qpos, qvel):
@@ -39,7 +39,7 @@ class ToyTask(TrainableTask):
         return self._state(qpos, qvel, jnp.float32(0.0), jnp.zeros((), bool), jnp.zeros((), jnp.int32))
 
     def step(self, state: State, action) -> State:
-        qpos, qvel, reward, terminated = self.move(state.physics.qpos, state.physics.qvel, action[0], state.steps)
+        qpos, qvel, reward, terminated = self.move(state.physics.qpos, state.physics.qvel, action[0])
         return self._state(qpos, qvel, jnp.float32(reward), jnp.asarray(terminated, bool), state.steps + 1)
 
     def _state(self, qpos, qvel, reward, terminated, steps) -> State:
@@ -59,7 +59,7 @@ class ToyTask(TrainableTask):
 class ConstantReward(ToyTask):
     """One step, reward 1."""
 
-    def move(self, qpos, qvel, action, steps):
+    def move(self, qpos, qvel, action):
         return qpos, qvel, 1.0, True
 
 
@@ -69,35 +69,35 @@ class ObservedReward(ToyTask):
     def start(self, key):
         return jax.random.rademacher(key, (1,), jnp.float32), jnp.zeros(1)
 
-    def move(self, qpos, qvel, action, steps):
+    def move(self, qpos, qvel, action):
         return qpos, qvel, qpos[0], True
 
 
 class DelayedReward(ToyTask):
     """Two steps, observed as 0 and 1; reward 1 on the second."""
 
-    def move(self, qpos, qvel, action, steps):
-        return qpos + 1.0, qvel, qpos[0], steps >= 1
+    def move(self, qpos, qvel, action):
+        return qpos + 1.0, qvel, qpos[0], qpos[0] >= 1.0
 
 
 class EndlessReward(ToyTask):
     """Reward 1 at every step; never ends, but the time limit cuts it off."""
 
-    def move(self, qpos, qvel, action, steps):
+    def move(self, qpos, qvel, action):
         return qpos, qvel, 1.0, False
 
 
 class RewardedAction(ToyTask):
     """One step; the best action is 0.5."""
 
-    def move(self, qpos, qvel, action, steps):
+    def move(self, qpos, qvel, action):
         return qpos, qvel, -jnp.square(action - 0.5), True
 
 
 class RewardedObservedAction(ObservedReward):
     """One step; the best action is half the observation."""
 
-    def move(self, qpos, qvel, action, steps):
+    def move(self, qpos, qvel, action):
         return qpos, qvel, -jnp.square(action - 0.5 * qpos[0]), True
 
 
@@ -118,8 +118,8 @@ class OneOf(ToyTask):
     def start(self, key):
         return self._choose(lambda task: task.start(key))
 
-    def move(self, qpos, qvel, action, steps):
-        return self._choose(lambda task: task.move(qpos, qvel, action, steps))
+    def move(self, qpos, qvel, action):
+        return self._choose(lambda task: task.move(qpos, qvel, action))
 
 
 class MountainCar(ToyTask):
@@ -133,7 +133,7 @@ class MountainCar(ToyTask):
     def start(self, key):
         return jax.random.uniform(key, (1,), minval=-0.6, maxval=-0.4), jnp.zeros(1)
 
-    def move(self, qpos, qvel, action, steps):
+    def move(self, qpos, qvel, action):
         qvel = qvel + jnp.clip(action, -1.0, 1.0) * 0.0015 - 0.0025 * jnp.cos(3.0 * qpos)
         qvel = jnp.clip(qvel, -0.07, 0.07)
         qpos = jnp.clip(qpos + qvel, -1.2, 0.6)

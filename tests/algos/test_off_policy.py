@@ -23,7 +23,7 @@ class FarAway(ToyTask):
     def start(self, key):
         return jnp.full(1, -1000.0), jnp.zeros(1)
 
-    def move(self, qpos, qvel, action, steps):
+    def move(self, qpos, qvel, action):
         return -qpos, qvel, 1.0, False
 
 
