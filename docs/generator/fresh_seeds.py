@@ -64,8 +64,7 @@ def means() -> str:
     rows = []
     for (task, algorithm), same in _blocks():
         final, best = _means(same, FINAL), _means(same, BEST)
-        bounds = interval(np.asarray(final)) or (np.nan, np.nan)
-        values = (np.mean(final), np.std(final, ddof=1), *bounds, min(final), np.mean(best))
+        values = (np.mean(final), np.std(final, ddof=1), *interval(np.asarray(final)), min(final), np.mean(best))
         cells = [format_score(float(value)) for value in values]
         rows.append([task, _shown(algorithm), *cells, _millions(same[0]), f"{_seconds(same[0]):,.0f}"])
     titles = ("Task", "Algorithm", ">Final, mean over seeds", ">Std over seeds", ">Interval from", ">Interval to")
