@@ -12,8 +12,8 @@ AS_A_USER = {"XLA_FLAGS": ""}
 """Compiled as XLA does unasked, which `conftest` doesn't wait for elsewhere."""
 
 SHORTER = {
-    "ppo": ("total_steps=150000", "algo.schedule_steps=150000"),
-    "td3": ("total_steps=100000", "algo.schedule_steps=100000"),
+    "ppo": ("total_steps=150000",),
+    "td3": ("total_steps=100000",),
 }
 
 

@@ -54,5 +54,5 @@ class Walker(Task):
 
 
 if __name__ == "__main__":
-    run = mjx_walk.run(["total_steps=2_000_000", "algo.schedule_steps=2_000_000"], task=Walker)
+    run = mjx_walk.run(["total_steps=2_000_000"], task=Walker)
     print(run.evaluate(episodes=20))

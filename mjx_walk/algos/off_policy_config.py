@@ -49,7 +49,7 @@ class OffPolicyConfig:
         at_least=1,
         only_if={"learning_rate_schedule": AnyBut("constant"), "final_discount": AnyBut(None)},
     )
-    """Environment steps over which schedules run, independent of `total_steps`: stopping early does not change them."""
+    """Environment steps over which schedules run. Recipes set it to `total_steps`; a resume keeps it."""
     max_grad_norm: float | None = setting(None, above=0)
     """Global norm to which gradients are clipped. If unset, they are not."""
     reward_scale: float = setting(1.0, above=0)

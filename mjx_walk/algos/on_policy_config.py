@@ -34,7 +34,7 @@ class OnPolicyConfig:
         at_least=1,
         only_if={"learning_rate_schedule": AnyBut("constant"), "entropy_schedule": AnyBut("constant")},
     )
-    """Environment steps over which schedules run, independent of `total_steps`: stopping early does not change them."""
+    """Environment steps over which schedules run. Recipes set it to `total_steps`; a resume keeps it."""
     max_policy_grad_norm: float = setting(1.0, above=0)
     """Global norm to which the policy's gradient is clipped."""
     max_value_grad_norm: float | None = setting(None, above=0)

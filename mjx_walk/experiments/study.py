@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjx_walk.experiments.search_space import SearchSpace
 from mjx_walk.experiments.suggestions import make_pruner, make_sampler, with_values
-from mjx_walk.settings.config import flatten, load_config
+from mjx_walk.settings.config import flatten, load_recipe
 from mjx_walk.settings.recipe_files import recipe_file
 from mjx_walk.settings.saved_config import differing_values, in_short
 from mjx_walk.storage.files import check_replaceable, refuse_links
@@ -80,7 +80,8 @@ def facts_of(space: SearchSpace, seeds: list[int]) -> Facts:
     chosen = [f"env.task={space.recipe.env.task}" if "env.task" in given else f"env={env}", f"algo={algo}"]
     chosen += [f"hardware={space.recipe.hardware}"] if "hardware" in given else []
     choosing = [text for text in space.fixed if text.partition("=")[0] in _CHOOSE_RECIPE]
-    plain, settings = flatten(load_config(choosing)), flatten(space.recipe)
+    settings = flatten(space.recipe)
+    plain = load_recipe(choosing, space.recipe.total_steps)
     changes = {key: value for key, value in settings.items() if value != plain.get(key) and key not in _OF_A_TRIAL}
     name = given.get("recipe", "").strip("'") or f"{space.recipe.hardware}/{env}_{algo}"
     ranges = {key: str(values) for key, values in space.ranges.items()}

@@ -32,6 +32,7 @@ __all__ = [
     "composing",
     "flatten",
     "load_config",
+    "load_recipe",
     "recipe_names",
     "to_config",
     "training_command",
@@ -128,6 +129,19 @@ def flatten(config: Config) -> dict[str, object]:
     return dict(leaves(OmegaConf.to_container(OmegaConf.structured(config))))
 
 
+def load_recipe(arguments: list[str], total_steps: int) -> dict[str, object]:
+    """The settings of a recipe, by their full keys, for a training of another length.
+
+    Args:
+        arguments: of the command line, which choose the recipe.
+        total_steps: other settings may follow from it. The recipe's own is returned.
+    """
+    recipe = load_config(arguments)
+    if recipe.total_steps == total_steps:
+        return flatten(recipe)
+    return flatten(load_config([*arguments, f"total_steps={total_steps}"])) | {"total_steps": recipe.total_steps}
+
+
 def training_command(config: Config) -> str:
     """The shortest training command for a configuration: a recipe, and the settings that differ from it.
 
@@ -139,7 +153,7 @@ def training_command(config: Config) -> str:
     own = flatten(config)
     commands = []
     for asked in (given, *([*given, recipe] for recipe in recipes)):
-        settings = flatten(load_config([f"hardware={config.hardware}", *asked]))
+        settings = load_recipe([f"hardware={config.hardware}", *asked], config.total_steps)
         relevant = (key for key in sorted(own) if not key.startswith(_IRRELEVANT) and has_effect(config, key))
         differing = (key for key in relevant if own[key] != settings.get(key))
         commands.append([*asked, *(shlex.quote(f"{key}={in_yaml(own[key])}") for key in differing)])

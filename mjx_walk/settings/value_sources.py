@@ -35,8 +35,12 @@ def as_yaml_with_sources(overrides: list[str]) -> str:
     read = read_overrides(overrides)
     compose_config(read)  # checks it
     with composing(read) as texts:
-        text = OmegaConf.to_yaml(compose("train", texts))
+        node = compose("train", texts)
+        text = OmegaConf.to_yaml(node, resolve=True)
         sources = _sources(GlobalHydra.instance().config_loader(), texts)
+    for key, value in leaves(OmegaConf.to_container(node)):
+        if isinstance(value, str) and value.startswith("${"):  # the value of another setting
+            sources[key] = f"{sources[key]}: {value}"
     if not any(override.startswith("hardware=") for override in overrides):
         sources["hardware"] = "devices of this machine"
     root = yaml.compose(text)

@@ -97,14 +97,17 @@ def with_name(schema: type[Schema], name: str) -> type[Schema]:
 
 
 def validate(config: Dataclass | type[Dataclass], prefix: str = "") -> None:
-    """Check the types and ranges of all settings of a dataclass and of the dataclasses in it.
+    """Check the types and ranges of all settings of a dataclass, and then of the dataclasses in it.
+
+    Settings of an inner dataclass may be computed from those around it, which are the ones to name.
 
     Raises:
         UserError: the first value of another type or out of range, with its full key. NaN is never in range.
     """
     hints = typing.get_type_hints(type(config))
-    for field in dataclasses.fields(config):
-        value, key = getattr(config, field.name), prefix + field.name
+    values = [(field, getattr(config, field.name)) for field in dataclasses.fields(config)]
+    for field, value in sorted(values, key=lambda pair: dataclasses.is_dataclass(pair[1])):
+        key = prefix + field.name
         if dataclasses.is_dataclass(value):
             validate(value, key + ".")
             continue

@@ -157,6 +157,18 @@ def test_a_given_setting_without_effect_is_refused_unless_a_run_is_resumed(tmp_p
         assert resolve([f"run_dir={tmp_path}", "resume=true", *further]).algo.schedule_steps == 7
 
 
+def test_schedules_end_with_a_new_run_and_stay_when_it_is_resumed(tmp_path):
+    config = load_config(["env=walker2d", "algo=csac", "hardware=gpu", "total_steps=5000"])
+    assert config.algo.schedule_steps == 5000
+    assert training_command(config) == "python -m mjx_walk.train env=walker2d algo=csac total_steps=5000"
+    part = load_config(["env=walker2d", "algo=csac", "hardware=gpu", "total_steps=5000", "algo.schedule_steps=8000"])
+    assert training_command(part).endswith("algo=csac algo.schedule_steps=8000 total_steps=5000")
+    save_config(config, tmp_path / "config.yaml")
+    resume = [f"run_dir={tmp_path}", "resume=true", "total_steps=9000"]
+    assert resolve(resume).algo.schedule_steps == 5000
+    assert resolve([*resume, "algo.schedule_steps=9000"]).algo.schedule_steps == 9000
+
+
 def test_a_shell_and_hydra_read_the_values_of_a_training_command(tmp_path):
     """Without a value, lists, truth values, and a file whose name has a space."""
     task = tmp_path / "my task.xml"

@@ -76,7 +76,7 @@ def test_of_a_file_of_one_s_own(printed, tmp_path, monkeypatch):
         f"healthy_z_range:  # recipe {tmp_path}/top.yaml",
         f"seed: 3  # recipe {tmp_path}/a b/base.yaml",
         "tau: 0.01  # recipe cpu/_off_policy",
-        "schedule_steps: 600000  # recipe cpu/sac",
+        "schedule_steps: 600000  # recipe cpu/sac: ${total_steps}",
     ):
         assert f"{line}\n" in text
 
