@@ -52,8 +52,8 @@ class State(flax.struct.PyTreeNode):
     truncated: Array
     """`[] bool`: the episode reached the time limit."""
     steps: Array
-    """`[] i32`: steps since the reset. In training, some episodes start at a random count: the first of each environment,
-    and in off-policy algorithms every second one after a fall."""
+    """`[] i32`: steps since the reset. In training, some episodes start at a random count: the first ones, and in
+    off-policy algorithms every second one after a fall."""
     metrics: dict[str, Array]
     """`[] f32` each: the reward terms under the names of Gymnasium's `info`, `nonfinite` and `overflow`."""
     draws: Draws | None = None

@@ -122,7 +122,7 @@ def test_wheel_and_sdist_hold_the_package_and_nothing_else(built):
     needed = {
         "mjx_walk/envs/humanoid.py",
         "mjx_walk/configs/train.yaml",
-        "mjx_walk/configs/recipe/gpu/humanoid_ppo.yaml",
+        "mjx_walk/configs/recipe/gpu/swimmer_ppo.yaml",
     }
     assert needed <= set(names)
     assert not [name for name in names if name.endswith(".xml")]  # Gymnasium's models stay Gymnasium's

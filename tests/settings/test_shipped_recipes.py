@@ -65,7 +65,7 @@ def test_no_recipe_gives_a_setting_without_effect(recipe):
 
 def test_a_task_without_a_recipe_takes_the_defaults_of_the_algorithm():
     """Under every name that a recipe has: alone, given, inherited from, and in a sweep."""
-    assert fallback("gpu/ant_ppo") == "gpu/ppo" and fallback("gpu/humanoid_ppo") is None is fallback("gpu/ppo")
+    assert fallback("gpu/ant_ppo") == "gpu/ppo" and fallback("gpu/swimmer_ppo") is None is fallback("gpu/ppo")
     base = ["env=ant", "algo=csac", "hardware=gpu"]
     expected = load_config([*base, "recipe=gpu/csac"])
     assert load_config(base) == load_config([*base, "recipe=gpu/ant_csac"]) == expected

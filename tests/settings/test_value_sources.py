@@ -36,15 +36,15 @@ def printed(capsys):
 
 
 def test_of_a_task_s_recipe_and_of_the_recipe_that_it_inherits(printed):
-    text = printed("hardware=gpu", "env=humanoid")
+    text = printed("hardware=gpu", "env=humanoid_standup")
     for line in (
-        "  name: humanoid  # command line",
-        "  contact_cost_range:  # default of humanoid",
+        "  name: humanoid_standup  # command line",
+        "  impact_cost_range:  # default of humanoid_standup",
         "  value_loss_coef: 0.5  # default of ppo",
         "  name: ppo  # default",
         "hardware: gpu  # command line",
         "seed: 0  # default",
-        "num_envs: 16384  # recipe gpu/humanoid_ppo",
+        "num_envs: 16384  # recipe gpu/humanoid_standup_ppo",
         "iterations_per_call: 4  # recipe gpu/ppo",
     ):
         assert f"{line}\n" in text
