@@ -193,6 +193,7 @@ def test_a_run_is_trained_resumed_scored_and_exported(tmp_path, monkeypatch, pat
     """A resumed run equals an uninterrupted one bit for bit, with the commands and the keys of its environments."""
     monkeypatch.chdir(tmp_path)
     settings = ["env=locomotion", f"env.xml_file={path}", "env.command_seconds=[0.02,0.1]", "env.weights.pose=0.4"]
+    settings.append(f"algo.schedule_steps={4 * TINY_CALL}")
     for folder, steps in (("whole", 4), ("parts", 2)):
         train_here(folder, *settings, f"total_steps={steps * TINY_CALL}", tiny=TINY[1:])
     train_here("parts", "resume=true", f"total_steps={4 * TINY_CALL}", tiny=[])

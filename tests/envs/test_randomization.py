@@ -181,7 +181,8 @@ def test_resume_is_exact(tmp_path):
     """Draws, late actions and the times of pushes are in the checkpoint."""
     settings = ("env.randomize=default", "env.randomize.num_models=16", "env.randomize.push_seconds=[0.02,0.05]")
     train_here(tmp_path / "full", *settings, f"total_steps={4 * TINY_CALL}")
-    train_here(tmp_path / "halves", *settings, f"total_steps={2 * TINY_CALL}")
+    half = (f"total_steps={2 * TINY_CALL}", f"algo.schedule_steps={4 * TINY_CALL}")
+    train_here(tmp_path / "halves", *settings, *half)
     train(tmp_path / "halves", "resume=true", f"total_steps={4 * TINY_CALL}", tiny=[])
     full, halves = leaves(tmp_path / "full", 4), leaves(tmp_path / "halves", 4)
     assert full.keys() == halves.keys()

@@ -60,7 +60,7 @@ def test_a_resumed_training_equals_one_that_never_stopped(algo, tmp_path):
     with unregistered():
         whole, part = tmp_path / "whole", tmp_path / "part"
         mjx_walk.run([*small(algo), "total_steps=256", f"run_dir={whole}"], task=task)
-        mjx_walk.run([*small(algo), "total_steps=128", f"run_dir={part}"], task=task)
+        mjx_walk.run([*small(algo), "total_steps=128", "algo.schedule_steps=256", f"run_dir={part}"], task=task)
         mjx_walk.run([f"run_dir={part}", "resume=true", "total_steps=256"], task=task)
     expected, found = leaves(whole, 4), leaves(part, 4)
     assert expected.keys() == found.keys() and any("xd.vel" in name for name in found)

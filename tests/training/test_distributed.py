@@ -179,7 +179,7 @@ def test_two_processes_learn_the_same_and_resume_exactly(tmp_path, tiny):
         3 * CALL,
         4 * CALL,
     ]
-    run(tmp_path / "parted", f"total_steps={2 * CALL}", tiny=tiny)
+    run(tmp_path / "parted", f"total_steps={2 * CALL}", f"algo.schedule_steps={4 * CALL}", tiny=tiny)
     run(tmp_path / "parted", f"total_steps={4 * CALL}", "resume=true", tiny=tiny)
     for one, two in zip(newest(tmp_path / "full"), newest(tmp_path / "parted"), strict=True):
         for name, leaf in one.items():

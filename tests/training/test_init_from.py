@@ -94,7 +94,7 @@ def test_another_algorithm_takes_the_best_policy(runs):
 def test_a_run_begins_with_a_policy_and_resumes_without_its_source(runs, tmp_path):
     """Its policy acts from the first step. Half a run and its rest equal a run without a break."""
     source = shutil.copytree(runs / "td3", tmp_path / "source")
-    settings = ("algo=td3", f"init_from={source}", "seed=2")
+    settings = ("algo=td3", f"init_from={source}", "seed=2", f"algo.schedule_steps={4 * TINY_CALL}")
     for name, parts in (("once", (4,)), ("twice", (2, 4))):
         for i, calls in enumerate(parts):
             if i:

@@ -74,7 +74,8 @@ def scored_run(tmp_path_factory):
     "physics", [*slow_except(["c"], ["c", "warp"]), pytest.param("jax", marks=[pytest.mark.slow, pytest.mark.long])]
 )
 def test_n_and_n_calls_equal_2n(tmp_path, physics, six_calls):
-    train_here(tmp_path / "halves", TASK[physics], f"physics={physics}", f"total_steps={3 * TINY_CALL}")
+    half = (f"total_steps={3 * TINY_CALL}", f"algo.schedule_steps={6 * TINY_CALL}")
+    train_here(tmp_path / "halves", TASK[physics], f"physics={physics}", *half)
     train(tmp_path / "halves", "resume=true", f"total_steps={6 * TINY_CALL}", tiny=[])
     full, halves = leaves(six_calls(physics), 6), leaves(tmp_path / "halves", 6)
     assert full.keys() == halves.keys() and len(full) > 50
@@ -95,7 +96,8 @@ def test_n_and_n_calls_equal_2n(tmp_path, physics, six_calls):
 def test_off_policy_resume_is_exact_with_the_replay(tmp_path, algo):
     """The first half ends after the replay has gone round, with truncated episodes in it."""
     train_here(tmp_path / "full", f"algo={algo}", f"total_steps={9 * TINY_CALL}", tiny=TINY_OFF_POLICY)
-    train_here(tmp_path / "halves", f"algo={algo}", f"total_steps={5 * TINY_CALL}", tiny=TINY_OFF_POLICY)
+    half = (f"total_steps={5 * TINY_CALL}", f"algo.schedule_steps={9 * TINY_CALL}")
+    train_here(tmp_path / "halves", f"algo={algo}", *half, tiny=TINY_OFF_POLICY)
     more = (f"algo={algo}", f"total_steps={9 * TINY_CALL}", "resume=true")
     (train if algo == "csac" else train_here)(tmp_path / "halves", *more, tiny=TINY_OFF_POLICY)
     full, halves = leaves(tmp_path / "full", 9), leaves(tmp_path / "halves", 9)
@@ -117,7 +119,8 @@ def test_policy_gradient_resume_is_exact(tmp_path, algo):
     ]
     tiny = [setting for setting in TINY if "num_epochs" not in setting]
     train_here(tmp_path / "full", *settings, f"total_steps={4 * TINY_CALL}", tiny=tiny)
-    train_here(tmp_path / "halves", *settings, f"total_steps={2 * TINY_CALL}", tiny=tiny)
+    half = (f"total_steps={2 * TINY_CALL}", f"algo.schedule_steps={4 * TINY_CALL}")
+    train_here(tmp_path / "halves", *settings, *half, tiny=tiny)
     train_here(tmp_path / "halves", f"total_steps={4 * TINY_CALL}", "resume=true", tiny=[])
     full, halves = leaves(tmp_path / "full", 4), leaves(tmp_path / "halves", 4)
     assert full.keys() == halves.keys() and len(full) > 40 and ("exploration" in full) == (algo == "a2c")

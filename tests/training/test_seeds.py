@@ -61,7 +61,7 @@ def test_seeds_side_by_side_are_the_runs_of_each(tmp_path, algo, tiny):
 @pytest.mark.slow
 def test_seeds_side_by_side_resume_exactly_and_each_may_go_on_alone(tmp_path, capsys):
     train_here(tmp_path / "full", f"total_steps={4 * TINY_CALL}", SEEDS)
-    train_here(tmp_path / "halves", f"total_steps={2 * TINY_CALL}", SEEDS)
+    train_here(tmp_path / "halves", f"total_steps={2 * TINY_CALL}", f"algo.schedule_steps={4 * TINY_CALL}", SEEDS)
     shutil.copytree(tmp_path / "halves", tmp_path / "one")
     further = (f"total_steps={4 * TINY_CALL}", "resume=true")
     train(tmp_path / "halves", *further, SEEDS, tiny=[])
