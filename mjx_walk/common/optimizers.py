@@ -64,7 +64,7 @@ def polyak_update(target: _ParamsT, params: _ParamsT, tau: float) -> _ParamsT:
 
 def remaining_fraction(steps: Float[Array, ""], horizon: int) -> Float[Array, ""]:
     """The fraction of a schedule that is left: 1 at the start, linearly to 0 at `horizon` steps, then 0."""
-    return jnp.clip(1.0 - steps / horizon, 0.0, 1.0)
+    return jnp.clip(1.0 - steps / float(horizon), 0.0, 1.0)  # as an integer, it might not fit into 32 bits
 
 
 def schedule_factor(schedule: str, remaining: Float[Array, ""]) -> Float[Array, ""] | float:

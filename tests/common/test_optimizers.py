@@ -12,6 +12,7 @@ def test_a_schedule_ends_at_its_horizon():
     assert (
         schedule_factor("linear", jnp.float32(0.25)) == 0.25 and schedule_factor("constant", jnp.float32(0.25)) == 1.0
     )
+    assert remaining_fraction(jnp.float32(25e10), 10**12) == pytest.approx(0.75)  # more than 32 bits
 
 
 def test_a_discounts_horizon_changes_by_the_same_factor_every_step():
