@@ -51,11 +51,12 @@ def test_the_pages_show_the_means_of_the_archive():
         for member in archive.getmembers():
             if member.name.endswith("eval_gymnasium.json"):
                 scores = json.load(archive.extractfile(member))
-                finals.setdefault(scores["env"], []).append(np.mean(scores["final"]["returns"]))
-    readme = [line.split(" | ") for line in (CLONE / "README.md").read_text().splitlines() if line.startswith("| ")]
-    shown = {cells[0].removeprefix("| "): cells[2] for cells in readme if len(cells) == 8}
-    for task, means in finals.items():
-        assert shown[task] == f"{np.mean(means):,.0f}"
+                algorithm = member.name.partition("/")[0].rpartition("_")[2]
+                finals.setdefault((scores["env"], algorithm), []).append(np.mean(scores["final"]["returns"]))
+    rows = [line.split(" | ") for line in (DOCS / "results.md").read_text().splitlines() if line.startswith("| ")]
+    shown = {(cells[0].removeprefix("| "), cells[1].lower()): cells[3] for cells in rows if cells[2:3] == ["final"]}
+    for recipe, means in finals.items():
+        assert float(shown[recipe].replace(",", "")) == pytest.approx(np.mean(means), rel=2e-3), recipe
 
 
 def test_the_archive_is_small_and_names_no_folder_of_a_user():

@@ -34,8 +34,8 @@ def test_readme_shows_the_best_recipe_of_each_task():
     """The scores of several seeds, or else the highest one of a single seed, which the table says."""
     shown = [row for row in cells("README.md") if row[0] in REFERENCES]
     assert [row[0] for row in shown] == list(REFERENCES)
-    log = [row for row in read("experiments.csv") if re.fullmatch(r"(EG|PT)\d+", row["id"])]
-    log = [row for row in log if row["verdict"] == "measured"]
+    arms = importlib.import_module("generator.best_recipes").ONE_SEED
+    log = [row for row in read("experiments.csv") if row["id"] in arms]
     results = importlib.import_module("generator.score_tables").results()
     for task, algorithm, score, _, seeds, *_ in shown:
         of_task = [row for row in results if row["task"] == task]
@@ -139,8 +139,6 @@ def test_pages_name_the_first_start_of_the_table():
         name: [int(x) for x in row] for name, *row in re.findall(r"\| (\w+) \| (\d+) \| (\d+) \| (\d+) \|", section)[:2]
     }
     assert starts.keys() == {"PPO", "csac"} and all(first - later == more for first, later, more in starts.values())
-    for page in ("README.md", "docs/quick_start.md"):
-        assert re.findall(r"(\d+) s (?:more|longer)", (CLONE / page).read_text()) == [str(starts["PPO"][2])]
 
 
 def test_the_error_that_pages_name_is_the_largest_of_the_table():

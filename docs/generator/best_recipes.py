@@ -7,11 +7,14 @@ from generator.markdown import code, table
 from generator.score_tables import highest_published, number, read, results
 from mjx_walk.experiments.suite import REFERENCES
 
-_ONE_SEED = {
-    "EG": ("csac", "at most 8 other runs"),
-    "PT": ("PPO", "1 other run"),
+ONE_SEED = {
+    "EF4": ("at most 4 other runs", " total_steps=9000000"),
+    "EG1": ("at most 8 other runs", " seed=1"),
+    "EF6": ("at most 4 other runs", " total_steps=9000000"),
+    "EB11": ("1 other run", ""),
+    "ED5": ("1 other run", ""),
 }
-"""Arms of the recipes with one seed, by the letters of their ids: the algorithm, and other trainings on the GPU."""
+"""Arms of the recipes with one seed: other trainings on the GPU, and what follows the task and the algorithm."""
 _DASH = "–"
 
 
@@ -44,7 +47,7 @@ def best_recipes() -> list[Best]:
             several.setdefault(row["task"], []).append(_of_several_seeds(row))
     one: dict[str, list[Best]] = {}
     for row in read("experiments.csv"):
-        if re.fullmatch(rf"({'|'.join(_ONE_SEED)})\d+", row["id"]) and row["verdict"] == "measured":
+        if row["id"] in ONE_SEED:
             one.setdefault(f"{row['task']}-{row['version']}", []).append(_of_one_seed(row))
     found = [several.get(task) or one[task] for task in REFERENCES]
     return [max(rows, key=lambda row: (float(row.score), -float(row.seconds))) for rows in found]
@@ -68,11 +71,12 @@ def _of_several_seeds(row: dict[str, str]) -> Best:
 
 
 def _of_one_seed(row: dict[str, str]) -> Best:
-    algorithm, shared_with = _ONE_SEED[row["id"][:2]]
+    shared_with, settings = ONE_SEED[row["id"]]
+    algorithm = row["algorithm"]
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", row["task"]).lower()
     return Best(
         task=f"{row['task']}-{row['version']}",
-        algorithm=algorithm,
+        algorithm=algorithm if algorithm == "csac" else algorithm.upper(),
         score=row["final_mean"],
         std_over_seeds="",
         std_over_episodes=row["std"],
@@ -80,7 +84,7 @@ def _of_one_seed(row: dict[str, str]) -> Best:
         million_steps=f"{int(row['steps']) / 1e6:.1f}",
         seconds=row["seconds"],
         shared_with=shared_with,
-        command=f"env={name} algo={algorithm.lower()}" + ("" if row["seeds"] == "0" else f" seed={row['seeds']}"),
+        command=f"env={name} algo={algorithm}{settings}",
     )
 
 

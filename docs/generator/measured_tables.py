@@ -35,13 +35,14 @@ def _drawn(path: Path) -> str:
 
 
 def _complete_runs() -> str:
-    """Training runs of PPO on Humanoid, each alone on a GPU."""
+    """Training runs of PPO on Humanoid."""
     log = {(row["id"], row["measure"]): row for row in read("experiments.csv")}
     rows = []
     for run in read("measured/complete_runs.csv"):
         speed, score = log[run["id"], "speed"], log[run["id"], "gymnasium"]
         cells = [run["recipe"], run["seed"], number(run["num_envs"]), number(speed["final_mean"]), score["seconds"]]
-        rows.append([*cells, run["process_seconds"], run["programs"], number(score["final_mean"]), score["std"]])
+        cells += [number(run["process_seconds"]), run["programs"] or "–"]
+        rows.append([*cells, number(score["final_mean"]), score["std"]])
     titles = ("Recipe", ">Seed", ">Environments", ">Steps/s", ">Training (s)", ">Process (s)", "JAX's programs")
     return table((*titles, ">Score", ">Std over episodes"), rows)
 

@@ -20,7 +20,7 @@ from mjx_walk.utils.setting_fields import describe
 
 
 def test_without_an_accelerator_the_small_recipe_is_chosen():
-    assert load_config([]).hardware == "cpu" and load_config(["hardware=gpu"]).num_envs == 16384
+    assert load_config([]).hardware == "cpu" and load_config(["hardware=gpu"]).num_envs == 8192
     assert load_config([]).num_envs == load_config(["hardware=cpu"]).num_envs == 128
 
 
