@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import functools
 import pickle
 import sys
 import time
@@ -12,17 +13,15 @@ import gymnasium
 import jax
 import numpy as np
 import sbx
+from peer_returns import KeptPolicy, write_returns
 from sbx.common.off_policy_algorithm import OffPolicyAlgorithmJax
 from stable_baselines3.common.callbacks import BaseCallback
 
 from mjx_walk.envs import BUILT_IN_TASKS, make_env
-from mjx_walk.evaluation.gymnasium_scores import score_in_gymnasium
-from mjx_walk.logs.metrics import write_csv
 from mjx_walk.storage.folders import replacing_folder
-from mjx_walk.storage.scores import Scores
 from mjx_walk.utils.errors import UserError
 
-__all__ = ["Keeper", "Kept", "resumed", "score"]
+__all__ = ["Keeper", "Kept", "resumed"]
 
 _DESCRIPTION = """
 Train SAC or TQC of Stable-Baselines JAX (SBX) in one environment of Gymnasium. Settings are those of rl-baselines3-zoo
@@ -106,14 +105,10 @@ def _save(folder: Path, model: OffPolicyAlgorithmJax, facts: str, kept: list[Kep
         (new / "kept.pickle").write_bytes(pickle.dumps((facts, kept)))
 
 
-def score(model: OffPolicyAlgorithmJax, task_name: str, kept: Kept, episodes: int) -> Scores:
-    """Scores of a kept policy in Gymnasium, without noise."""
-    model.policy.actor_state = model.policy.actor_state.replace(params=kept.params)
-
-    def act(obs: np.ndarray) -> np.ndarray:
-        return model.predict(obs, deterministic=True)[0]
-
-    return score_in_gymnasium(make_env(task_name, physics="c"), act, episodes)  # type: ignore[arg-type]
+def _act(model: OffPolicyAlgorithmJax, params: Any, obs: np.ndarray) -> np.ndarray:
+    """Actions of a kept policy, without noise."""
+    model.policy.actor_state = model.policy.actor_state.replace(params=params)
+    return model.predict(obs, deterministic=True)[0]
 
 
 def main() -> None:
@@ -136,13 +131,8 @@ def main() -> None:
         model.learn(left, keeper, reset_num_timesteps=not kept)
         keeper.keep()
         _save(given.out / "training", model, _facts(given.algo, env, given.seed), kept)
-    rows = []
-    for one in kept:
-        scores = score(model, given.env, one, given.episodes if one is kept[-1] else -(-given.episodes // 5))
-        figures = {"mean": round(scores.mean, 2), "std": round(scores.std, 2)}
-        rows.append({"steps": one.steps, "seconds": round(one.seconds, 1), "episodes": len(scores.returns)} | figures)
-        print(rows[-1], flush=True)
-    write_csv(rows, given.out / "returns.csv")
+    policies = [KeptPolicy(x.steps, x.seconds, functools.partial(_act, model, x.params)) for x in kept]
+    write_returns(given.out, given.env, policies, given.episodes)
 
 
 if __name__ == "__main__":

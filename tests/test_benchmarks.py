@@ -10,6 +10,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 import pytest
 from helpers import CLONE, PAGES, TINY_OFF_POLICY, command_here
 from program_costs import matmul_flops, reduced_bytes
@@ -28,9 +29,13 @@ def exit_code(name, *arguments):
 
 def test_programs_that_the_documentation_names_are_there(capsys):
     named = {name for text in PAGES.values() for name in re.findall(r"python benchmarks/(\S+\.py)", text)}
-    assert named == {path.name for path in (CLONE / "benchmarks").glob("*.py")} - {"program_costs.py"}
-    if importlib.util.find_spec("sbx") is None:
-        named.remove("sbx_training.py")
+    assert named == {path.name for path in (CLONE / "benchmarks").glob("*.py")} - {
+        "peer_returns.py",
+        "program_costs.py",
+    }
+    for name, package in (("sbx_training.py", "sbx"), ("cleanrl_training.py", "envpool")):
+        if importlib.util.find_spec(package) is None:
+            named.remove(name)
     for name in named:
         assert exit_code(name, "--help") == 0
         assert capsys.readouterr().out.startswith(f"usage: python benchmarks/{name} ")
@@ -60,6 +65,60 @@ def test_a_training_of_sbx_continues_and_is_scored(tmp_path, monkeypatch):
     assert [row[0] for row in rows] == ["1", "20", "40", "60"] and [row[2] for row in rows] == ["1", "1", "1", "5"]
     seconds = [float(row[1]) for row in rows]
     assert seconds == sorted(seconds) and all(1 <= float(row[3]) <= 1000 for row in rows)
+
+
+CLEANRL_LIKE = """
+import sys
+import gymnasium as gym
+import torch
+
+settings = dict(argument.removeprefix("--").split("=") for argument in sys.argv[1:])
+envs = gym.vector.SyncVectorEnv([lambda: gym.make(settings["env-id"])])
+agent = torch.nn.Module()
+agent.actor_mean = torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1))
+obs, _ = envs.reset(seed=int(settings["seed"]))
+for _ in range(int(settings["total-timesteps"]) // len(obs)):
+    with torch.no_grad():
+        obs = torch.Tensor(envs.step(agent.actor_mean(torch.Tensor(obs)).numpy())[0])
+    assert obs.abs().max() <= 10
+"""
+"""The names that CleanRL's file has, which is in no package registry."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seconds", "steps"), [("1000", [40, 80, 100]), ("0", [4])])
+def test_policies_of_cleanrl_are_kept_on_the_way_and_scored(tmp_path, monkeypatch, seconds, steps):
+    pytest.importorskip("envpool")
+    script = tmp_path / "ppo_continuous_action.py"
+    script.write_text(CLEANRL_LIKE)
+    settings = ("--env", "inverted_pendulum", "--total-steps", "100", "--num-envs", "4", "--every", "40")
+    out = ("--episodes", "10", "--seconds", seconds, "--out", str(tmp_path / "out"))
+    monkeypatch.setattr(sys, "argv", ["cleanrl_training.py", str(script), *settings, *out])
+    runpy.run_path(str(CLONE / "benchmarks" / "cleanrl_training.py"), run_name="__main__")
+    header, *rows = (line.split(",") for line in (tmp_path / "out" / "returns.csv").read_text().splitlines())
+    assert header == ["steps", "seconds", "episodes", "mean", "std"]
+    assert [int(row[0]) for row in rows] == steps and [row[2] for row in rows] == ["2"] * (len(steps) - 1) + ["10"]
+    assert all(1 <= float(row[3]) <= 1000 for row in rows)
+
+
+@pytest.mark.slow
+def test_a_kept_policy_of_cleanrl_acts_as_the_agent_did():
+    pytest.importorskip("envpool")
+    torch, training = (importlib.import_module(name) for name in ("torch", "cleanrl_training"))
+    pool = training.Pool("InvertedPendulum-v5", 4, 0, 1000, 1000.0)
+    env = training.make_vector_env(pool)
+    env.reset()
+    agent = torch.nn.Module()
+    agent.actor_mean = torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1))
+    for _ in range(20):
+        normalized, *_ = env.step(np.ones((4, 1)))
+    pool.keep(agent)
+    statistics = pool.observation_statistics
+    obs = normalized * np.sqrt(statistics.var + 1e-8) + statistics.mean
+    with torch.no_grad():
+        expected = agent.actor_mean(torch.Tensor(normalized)).numpy().clip(-3, 3)
+        agent.actor_mean[0].weight += 1
+    np.testing.assert_allclose(pool.kept[0].act(obs), expected, atol=1e-5)
 
 
 @pytest.mark.slow
