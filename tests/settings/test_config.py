@@ -7,7 +7,7 @@ import sys
 
 import pytest
 import yaml
-from helpers import used_settings
+from helpers import CLONE, used_settings
 
 from mjx_walk import train as train_command
 from mjx_walk.algos import ALGORITHMS
@@ -22,6 +22,15 @@ from mjx_walk.utils.setting_fields import describe
 def test_without_an_accelerator_the_small_recipe_is_chosen():
     assert load_config([]).hardware == "cpu" and load_config(["hardware=gpu"]).num_envs == 8192
     assert load_config([]).num_envs == load_config(["hardware=cpu"]).num_envs == 128
+
+
+def test_the_command_with_the_settings_of_stable_baselines3_leaves_none_to_a_recipe():
+    page = (CLONE / "docs" / "from_stable_baselines3.md").read_text()
+    _, _, _, *words = shlex.split(next(line for line in page.splitlines() if line.startswith("python -m")))
+    algos = [load_config([f"hardware={hardware}", *words]).algo for hardware in ("cpu", "gpu")]
+    schedules = {"schedule_steps": 1, "entropy_schedule": "constant"}  # without effect: nothing falls
+    assert dataclasses.replace(algos[0], **schedules) == dataclasses.replace(algos[1], **schedules)
+    assert not algos[0].normalize_rewards and algos[0].learning_rate_schedule == "constant"
 
 
 def test_overrides_beat_the_recipe(tmp_path):
