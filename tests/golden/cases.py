@@ -112,7 +112,7 @@ _ALL = {
     "sac": (*_ALL_OFF_POLICY, "algo.final_target_entropy=-1.0", "algo.init_alpha=0.1"),
     "csac": (*_ALL_OFF_POLICY, "algo.final_target_entropy=-1.0", "algo.num_atoms=31"),
     "td3": (*_ALL_OFF_POLICY, *_EXPLORATION, "algo.target_noise=0.3", "algo.target_noise_clip=0.4"),
-    "ddpg": (*_ALL_OFF_POLICY, *_EXPLORATION, "algo.normalize_observations=false"),
+    "ddpg": (*_ALL_OFF_POLICY, *_EXPLORATION, "algo.normalize_observations=false", "seed=1"),
 }
 
 
