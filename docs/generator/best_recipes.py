@@ -3,6 +3,7 @@
 import re
 from typing import NamedTuple
 
+from generator.fresh_seeds import shown_algorithm
 from generator.markdown import code, table
 from generator.score_tables import highest_published, number, read, results
 from mjx_walk.experiments.suite import REFERENCES
@@ -76,7 +77,7 @@ def _of_one_seed(row: dict[str, str]) -> Best:
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", row["task"]).lower()
     return Best(
         task=f"{row['task']}-{row['version']}",
-        algorithm=algorithm if algorithm == "csac" else algorithm.upper(),
+        algorithm=shown_algorithm(algorithm),
         score=row["final_mean"],
         std_over_seeds="",
         std_over_episodes=row["std"],

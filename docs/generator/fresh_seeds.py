@@ -42,7 +42,7 @@ def recipes() -> list[dict[str, str]]:
     for (task, algorithm), same in _blocks():
         scores = _means(same, FINAL)
         row = {
-            **{"task": task, "algorithm": _shown(algorithm), "policy": FINAL},
+            **{"task": task, "algorithm": shown_algorithm(algorithm), "policy": FINAL},
             **{"score": _in_csv(np.mean(scores)), "std": _in_csv(np.std(scores, ddof=1))},
             **{"lowest_seed": _in_csv(min(scores)), "seeds": str(len(same)), "million_steps": _millions(same[0])},
             **{"seconds": f"{_seconds(same[0]):.0f}", "seeds_per_process": f"{same[0].seeds_together:.0f}"},
@@ -59,7 +59,9 @@ def seeds() -> str:
     rows = []
     for run in runs():
         final, best = ([block["mean"], block["std"], min(block["returns"])] for block in map(run.score, (FINAL, BEST)))
-        rows.append([run.task, _shown(run.config.algo.name), str(run.config.seed), *map(format_score, final + best)])
+        rows.append(
+            [run.task, shown_algorithm(run.config.algo.name), str(run.config.seed), *map(format_score, final + best)]
+        )
     titles = ("Task", "Algorithm", ">Seed", ">Final", ">Std", ">Lowest", ">Best", ">Its std", ">Its lowest")
     return table(titles, rows)
 
@@ -71,7 +73,7 @@ def means() -> str:
         final, best = _means(same, FINAL), _means(same, BEST)
         values = (np.mean(final), np.std(final, ddof=1), *interval(np.asarray(final)), min(final), np.mean(best))
         cells = [format_score(float(value)) for value in values]
-        rows.append([task, _shown(algorithm), *cells, _millions(same[0]), f"{_seconds(same[0]):,.0f}"])
+        rows.append([task, shown_algorithm(algorithm), *cells, _millions(same[0]), f"{_seconds(same[0]):,.0f}"])
     titles = ("Task", "Algorithm", ">Final, mean over seeds", ">Std over seeds", ">Interval from", ">Interval to")
     return table((*titles, ">Lowest seed", ">Best, mean over seeds", ">Steps (M)", ">Training of all seeds (s)"), rows)
 
@@ -83,7 +85,7 @@ def budgets() -> str:
     for (task, algorithm), same in _blocks():
         reached = at_budgets(same)
         final = format_score(float(np.mean(_means(same, FINAL))))
-        rows.append([task, _shown(algorithm), *(reached[title] for title in steps), final, _millions(same[0])])
+        rows.append([task, shown_algorithm(algorithm), *(reached[title] for title in steps), final, _millions(same[0])])
     titles = [f">After {title}" for title in steps]
     return table(("Task", "Algorithm", *titles, ">Final", ">Steps of the final (M)"), rows)
 
@@ -98,7 +100,8 @@ def _means(same: list[LoggedRun], policy: str) -> list[float]:
     return [run.score(policy)["mean"] for run in same]
 
 
-def _shown(algorithm: str) -> str:
+def shown_algorithm(algorithm: str) -> str:
+    """The name of an algorithm as tables show it."""
     return algorithm if algorithm == "csac" else algorithm.upper()
 
 

@@ -41,7 +41,7 @@ def _complete_runs() -> str:
     for run in read("measured/complete_runs.csv"):
         speed, score = log[run["id"], "speed"], log[run["id"], "gymnasium"]
         cells = [run["recipe"], run["seed"], number(run["num_envs"]), number(speed["final_mean"]), score["seconds"]]
-        cells += [number(run["process_seconds"]), run["programs"] or "–"]
+        cells += [number(run["process_seconds"]), _shown(run["programs"])]
         rows.append([*cells, number(score["final_mean"]), score["std"]])
     titles = ("Recipe", ">Seed", ">Environments", ">Steps/s", ">Training (s)", ">Process (s)", "JAX's programs")
     return table((*titles, ">Score", ">Std over episodes"), rows)

@@ -1,4 +1,4 @@
-"""Tables of the seeds that no recipe was tuned on, and of PPO on the other tasks, from experiments.csv."""
+"""Tables of the seeds that no recipe was tuned on, and of the search for PPO's recipe, from experiments.csv."""
 
 import scipy.stats
 
